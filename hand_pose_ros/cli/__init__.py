@@ -1,0 +1,52 @@
+"""The `hand-pose` command: one file per verb, imported only when it is asked for.
+
+A verb is a module with `add_parser(subparsers)` and `run(args) -> int`. Exit codes: 0 done, 1 failed, 2 bad arguments.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from collections.abc import Sequence
+
+from hand_pose_ros import __version__
+from hand_pose_ros.errors import HandPoseError
+
+VERBS = {
+    'demo': 'play the recorded bag that ships through the live node and show what comes out',
+    'estimate': 'joints and pictures from a bag or from 16-bit depth PNGs',
+    'estimator': 'the ROS 2 node',
+    'replay': 'publish a bag on ROS topics',
+    'evaluate': 'score a prediction file, or the estimator on a bag',
+    'compare': 'several results side by side',
+    'train': 'train a network from a recipe',
+    'synth': 'make or show synthetic depth hands',
+    'bench': 'measure speed on this machine',
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one verb and return the exit code."""
+    argv = list(sys.argv[1:] if argv is None else argv)
+    parser = argparse.ArgumentParser(
+        prog='hand-pose', description='3D hand joints from depth images.',
+        epilog='hand-pose VERB --help says more about each verb.')
+    parser.add_argument('--version', action='version', version=f'hand-pose {__version__}')
+    subparsers = parser.add_subparsers(dest='verb', metavar='VERB', required=True)
+    # Only the verb that was asked for is imported: torch, matplotlib and ROS are slow to load.
+    for verb, summary in VERBS.items():
+        if argv and argv[0] == verb:
+            module = importlib.import_module(f'hand_pose_ros.cli.{verb}')
+            module.add_parser(subparsers)
+        else:
+            subparsers.add_parser(verb, help=summary)
+    args = parser.parse_args(argv)
+    try:
+        return module.run(args)
+    except HandPoseError as error:
+        print(f'hand-pose {args.verb}: {error}', file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print(f'hand-pose {args.verb}: interrupted', file=sys.stderr)
+        return 1

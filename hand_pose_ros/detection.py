@@ -1,0 +1,123 @@
+"""Where in a depth image a hand may be: depth -> cubes.
+
+The paper's assumption is that the hand is the nearest object to the camera (section 3; Oberweger et al. 2015). Its
+detector is kept, with sizes in metres instead of pixels, no bias at the border of the image, and a minimum size.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hand_pose_ros.geometry import Cube, Intrinsics
+
+MIN_AREA_M2 = 15e-4
+"""What is smaller than this, seen from the camera, is a speck or a cable: a fist seen end on has about 40 cm2."""
+MIN_CUBE_AREA_M2 = 25e-4
+"""A cube must hold at least this much surface to hold a hand."""
+MAX_BORDER = 0.6
+"""Share of the cube's outline that may be covered: an arm leaves through one side, a table or a wall through all."""
+
+_WORK_WIDTH = 160
+_SLAB_M = 0.03
+_ITERATIONS = 5
+
+
+class _Scene:
+    """A depth image thinned out to about 160 columns, with what each of its pixels measures in the world."""
+
+    def __init__(self, depth: NDArray[np.float32], intrinsics: Intrinsics, near: float, far: float) -> None:
+        self.stride = max(1, intrinsics.width // _WORK_WIDTH)
+        first = self.stride // 2
+        z = depth[first::self.stride, first::self.stride]
+        self.z = np.where((z >= near) & (z <= far), z, np.float32(0))
+        rows, cols = self.z.shape
+        self.x = (np.arange(cols, dtype=np.float32) * self.stride + first - intrinsics.cx) / intrinsics.fx
+        self.y = (np.arange(rows, dtype=np.float32) * self.stride + first - intrinsics.cy) / intrinsics.fy
+        self.pixel_area = self.stride ** 2 / (intrinsics.fx * intrinsics.fy)  # m2 at 1 m; grows with z squared
+
+    def window(self, center: NDArray[np.float64], side: float) -> tuple[slice, slice]:
+        """Rows and columns whose rays meet the plane of the cube's centre inside the cube."""
+        (x, y, z), half = center, side / 2
+        cols = np.searchsorted(self.x, [(x - half) / z, (x + half) / z])
+        rows = np.searchsorted(self.y, [(y - half) / z, (y + half) / z])
+        return slice(*rows), slice(*cols)
+
+    def inside(self, center: NDArray[np.float64], side: float) -> tuple[NDArray[np.float32], NDArray[np.bool_], slice, slice]:
+        """Depth in the window of a cube, which of it lies within the cube, and the window."""
+        rows, cols = self.window(center, side)
+        z = self.z[rows, cols]
+        return z, (z > 0) & (np.abs(z - center[2]) <= side / 2), rows, cols
+
+    def centroid(self, z: NDArray[np.float32], mask: NDArray[np.bool_], rows: slice, cols: slice) -> NDArray[np.float64]:
+        """Centre of mass of the masked pixels: mean position in the image and mean depth, as a point in metres."""
+        count = mask.sum()
+        depth = z[mask].mean(dtype=np.float64)
+        x = mask.sum(0) @ self.x[cols] / count
+        y = mask.sum(1) @ self.y[rows] / count
+        return np.array([x * depth, y * depth, depth])
+
+
+def detect(depth: NDArray[np.float32], intrinsics: Intrinsics, *, side: float = 0.30, near: float = 0.1,
+           far: float = 1.5, max_hands: int = 1) -> list[Cube]:
+    """Cubes around the nearest hand-sized objects, nearest first; empty when there is none.
+
+    Starting at the camera, everything nearer than a growing distance is looked at. The first connected piece of at
+    least MIN_AREA_M2 starts a cube, which moves to the centre of mass of what it holds (5 iterations, as the original
+    code does). A cube that holds too little, or that is cut through all around as by a wall or a table, is no hand.
+
+    Args:
+        depth: (H, W) float32 metres, 0 = no reading.
+        side: of the cubes, metres.
+        near, far: range in which hands are looked for, metres.
+    """
+    scene = _Scene(depth, intrinsics, near, far)
+    found: list[Cube] = []
+    z = scene.z
+    present = z[z > 0]
+    if present.size == 0:
+        return found
+    for limit in np.arange(present.min() + _SLAB_M, present.max() + _SLAB_M, _SLAB_M):
+        count, labels, stats, _ = cv2.connectedComponentsWithStats(((z > 0) & (z < limit)).view(np.uint8), connectivity=4)
+        for label in range(1, count):
+            # Nearly all pieces are specks: their number of pixels at the limit bounds their area from above.
+            if stats[label, cv2.CC_STAT_AREA] * scene.pixel_area * limit ** 2 < MIN_AREA_M2:
+                continue
+            piece = labels == label
+            if float(np.sum(np.square(z[piece]))) * scene.pixel_area < MIN_AREA_M2:
+                continue
+            center = _settle(scene, scene.centroid(z, piece, slice(None), slice(None)), side)
+            if _may_hold_a_hand(scene, center, side):
+                found.append(Cube((float(center[0]), float(center[1]), float(center[2])), side))
+            # Whatever it was, it has been judged: look behind and beside it.
+            depth_in, inside, rows, cols = scene.inside(center, side)
+            z[rows, cols][inside] = 0
+            z[piece] = 0
+            if len(found) == max_hands:
+                return found
+    return found
+
+
+def _settle(scene: _Scene, center: NDArray[np.float64], side: float) -> NDArray[np.float64]:
+    """Move a cube to the centre of mass of what it holds (original code; the paper trains on such centres)."""
+    for _ in range(_ITERATIONS):
+        z, inside, rows, cols = scene.inside(center, side)
+        if not inside.any():
+            break
+        center = scene.centroid(z, inside, rows, cols)
+    return center
+
+
+def _may_hold_a_hand(scene: _Scene, center: NDArray[np.float64], side: float) -> bool:
+    z, inside, _, _ = scene.inside(center, side)
+    if float(np.sum(np.square(z[inside]))) * scene.pixel_area < MIN_CUBE_AREA_M2:
+        return False
+    outline = np.concatenate([inside[0], inside[-1], inside[1:-1, 0], inside[1:-1, -1]])
+    return bool(outline.mean() <= MAX_BORDER)
+
+
+def holds_a_hand(depth: NDArray[np.float32], intrinsics: Intrinsics, cube: Cube, *, near: float = 0.1,
+                 far: float = 1.5) -> bool:
+    """Whether a tracked cube still holds an object that may be a hand: the honest test of being lost."""
+    return _may_hold_a_hand(_Scene(depth, intrinsics, near, far), np.array(cube.center), cube.side)

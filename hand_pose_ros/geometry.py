@@ -1,0 +1,138 @@
+"""Pinhole camera, the metric cube around a hand, and the crop that a network sees.
+
+Everything is in metres and in the camera's optical frame (x right, y down, z forward; REP-103). Pixel (u, v) has u to
+the right, and integers are pixel centres.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hand_pose_ros.errors import InputError
+
+PATCH_SIZE = 128
+"""Width and height of a patch in pixels (paper, section 3)."""
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """Pinhole intrinsics in pixels of a `width` x `height` image."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        values = (self.fx, self.fy, self.cx, self.cy)
+        if not (np.isfinite(values).all() and self.fx > 0 and self.fy > 0):
+            raise InputError(
+                f'camera intrinsics fx={self.fx}, fy={self.fy}, cx={self.cx}, cy={self.cy} are not usable: '
+                'the focal lengths must be positive and all four finite (is the camera calibrated?)')
+        if self.width <= 0 or self.height <= 0:
+            raise InputError(f'camera intrinsics are for an image of {self.width}x{self.height} pixels, which is empty')
+
+    @classmethod
+    def from_camera_info(cls, info: Any, *, rectified: bool = True) -> Intrinsics:
+        """The intrinsics of the image that a sensor_msgs/CameraInfo belongs to (any object with its fields).
+
+        `rectified` takes the projection matrix P where it is filled in, else (and otherwise) the raw matrix K. Binning
+        and the region of interest are applied: both describe how the published image was cut out of the full sensor
+        (sensor_msgs/CameraInfo).
+
+        Raises:
+            InputError: K is zero (an uncalibrated camera) or the size is empty.
+        """
+        k, p = list(info.k), list(info.p)
+        fx, fy, cx, cy = (p[0], p[5], p[2], p[6]) if rectified and p[0] != 0 else (k[0], k[4], k[2], k[5])
+        if fx == 0:
+            raise InputError(
+                'camera_info has a zero camera matrix: the camera is not calibrated; calibrate it, or set the '
+                'parameters intrinsics.fx, intrinsics.fy, intrinsics.cx and intrinsics.cy')
+        roi = info.roi
+        width, height = roi.width or info.width, roi.height or info.height
+        bin_x, bin_y = info.binning_x or 1, info.binning_y or 1
+        return cls(fx=fx / bin_x, fy=fy / bin_y, cx=(cx - roi.x_offset) / bin_x, cy=(cy - roi.y_offset) / bin_y,
+                   width=width // bin_x, height=height // bin_y)
+
+    def check_size(self, width: int, height: int) -> None:
+        """Raise InputError unless the intrinsics belong to an image of this size."""
+        if (width, height) != (self.width, self.height):
+            raise InputError(
+                f'the depth image has {width}x{height} pixels but its camera_info describes {self.width}x{self.height}: '
+                'use the camera_info that is published beside this very image')
+
+    def project(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Points (..., 3) in metres -> pixels (..., 2)."""
+        points = np.asarray(points, np.float64)
+        z = points[..., 2]
+        return np.stack([points[..., 0] / z * self.fx + self.cx, points[..., 1] / z * self.fy + self.cy], axis=-1)
+
+    def back_project(self, pixels: ArrayLike, z: ArrayLike) -> NDArray[np.float64]:
+        """Pixels (..., 2) and their depth (...) in metres -> points (..., 3) in metres."""
+        pixels, z = np.asarray(pixels, np.float64), np.asarray(z, np.float64)
+        return np.stack([(pixels[..., 0] - self.cx) / self.fx * z, (pixels[..., 1] - self.cy) / self.fy * z, z], axis=-1)
+
+
+@dataclass(frozen=True)
+class Cube:
+    """The metric cube in which a hand is looked for: `center` (x, y, z) in metres and the length of a `side` in metres.
+
+    *Cube units* of a point are its position in the patch and its depth: column and row of the patch in [-1, 1], and
+    depth from the front face (-1) to the back face (+1). They follow the rays of the camera, as the patch does, so that
+    a network sees exactly what it is asked for, wherever in the image the hand is. (The original code takes metric
+    offsets from the centre instead; the two differ by the perspective inside the cube.)
+    """
+
+    center: tuple[float, float, float]
+    side: float
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.center).all() and self.center[2] > 0 and self.side > 0):
+            raise InputError(f'a cube with centre {self.center} and side {self.side} is not in front of the camera')
+
+    def to_cube(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Points (..., 3) in metres -> cube units (..., 3)."""
+        points = np.asarray(points, np.float64)
+        x, y, z = self.center
+        on_plane = points * (z / points[..., 2:3])  # along the ray onto the plane of the centre
+        on_plane[..., 2] = points[..., 2]
+        return (on_plane - np.array([x, y, z])) / (self.side / 2)
+
+    def from_cube(self, coordinates: ArrayLike) -> NDArray[np.float64]:
+        """Cube units (..., 3) -> points (..., 3) in metres; the exact inverse of `to_cube`."""
+        x, y, z = self.center
+        points = np.asarray(coordinates, np.float64) * (self.side / 2) + np.array([x, y, z])
+        points[..., :2] *= points[..., 2:3] / z
+        return points
+
+
+def crop(depth: NDArray[np.float32], cube: Cube, intrinsics: Intrinsics, size: int = PATCH_SIZE) -> NDArray[np.float32]:
+    """What lies in the cube, as a patch (1, size, size) in [-1, 1] (paper, section 3; nearest neighbour).
+
+    -1 is the front face of the cube, +1 the back face. No reading (0 in `depth`, or outside the image) and everything
+    behind the back face are +1; whatever is before the front face is -1, so that a finger that leaves the cube towards
+    the camera stays visible.
+
+    Args:
+        depth: (H, W) float32 in metres, 0 = no reading.
+    """
+    (u, v), half = intrinsics.project(cube.center), cube.side / 2
+    z = cube.center[2]
+    # Pixel (i, j) of the patch is at (i + 0.5) / (size / 2) - 1 in cube units.
+    step = 2 / size * half / z
+    affine = np.array([[intrinsics.fx * step, 0, u + intrinsics.fx * step * (0.5 - size / 2)],
+                       [0, intrinsics.fy * step, v + intrinsics.fy * step * (0.5 - size / 2)]])
+    patch = cv2.warpAffine(depth, affine, (size, size), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
+                           borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+    patch[patch == 0] = z + half
+    patch -= z
+    patch /= half
+    return np.clip(patch, -1, 1, out=patch)[None]

@@ -1,0 +1,1 @@
+"""Fresh labelled depth images of hands: the hand, its poses, the renderer, the sensors."""

@@ -1,0 +1,229 @@
+"""One depth image in, the joints of its hands out: detect, crop, predict, uncrop.
+
+Numpy in and out; the networks run behind `runtime`. The estimator remembers the hands of the last image, so that the
+next one need not be searched.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from itertools import count
+from os import PathLike
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hand_pose_ros.detection import detect, holds_a_hand
+from hand_pose_ros.errors import InputError
+from hand_pose_ros.geometry import Cube, Intrinsics, crop
+from hand_pose_ros.models.checkpoints import load_checkpoint
+from hand_pose_ros.runtime import Engine, make_engine
+from hand_pose_ros.scoring import explain
+from hand_pose_ros.skeleton import Skeleton, get_skeleton
+
+Side = Literal['left', 'right', 'unknown']
+
+RECENTER_M = 0.015
+"""A cube whose centre is further than this from the middle of the joints it gave is moved there and read again."""
+SIDE_MEMORY = 0.9
+"""What a hand has shown of its side fades by this factor each image: about ten images decide."""
+
+
+@dataclass(frozen=True)
+class HandEstimate:
+    """One hand in one image.
+
+    Attributes:
+        joints: (J, 3) float32, metres, optical frame of the camera.
+        joint_names: the J names, in the order of the skeleton.
+        confidence: (J,) float32 in [0, 1].
+        score: of the whole hand, in [0, 1].
+        side: 'left', 'right' or 'unknown'.
+        cube: what the network looked at.
+        id: the same from image to image as long as the hand is tracked.
+    """
+
+    joints: NDArray[np.float32]
+    joint_names: tuple[str, ...]
+    confidence: NDArray[np.float32]
+    score: float
+    side: Side
+    cube: Cube
+    id: str
+
+
+@dataclass
+class _Track:
+    """A hand that was seen in the last image."""
+
+    id: str
+    center: tuple[float, float, float]
+    rightness: float = 0.0  # > 0: has looked more like a right hand
+
+
+@dataclass(frozen=True)
+class _Reading:
+    """What the network says of one cube: joints in metres, and how far it looked like a right hand."""
+
+    cube: Cube
+    joints: NDArray[np.float64]
+    confidence: NDArray[np.float32]
+    score: float
+    rightness: float = 0.0
+
+
+@dataclass
+class HandPoseEstimator:
+    """Depth images to 3D hand joints.
+
+    Args:
+        engine: runs the network, `patches (N, 1, 128, 128) -> joints (N, J, 3)` in cube units of a right hand.
+        skeleton: the joints that the network gives.
+        cube_side: length of the cube's side in metres; the network was trained for about this size.
+        side: 'auto' finds out which hand it is; 'left' or 'right' states it.
+        max_hands: at most this many hands per image.
+        min_score: hands with a lower score are not reported.
+        near, far: range in which hands are looked for, metres.
+        tracking: look first where the hands of the last image were.
+    """
+
+    engine: Engine
+    skeleton: Skeleton
+    cube_side: float = 0.30
+    side: Literal['auto', 'left', 'right'] = 'auto'
+    max_hands: int = 1
+    min_score: float = 0.3
+    near: float = 0.1
+    far: float = 1.5
+    tracking: bool = True
+    metadata: dict[str, Any] = field(default_factory=dict)
+    timings: dict[str, float] = field(default_factory=dict, init=False)
+    """Seconds that each stage of the last image took: detect, crop, predict, uncrop."""
+
+    def __post_init__(self) -> None:
+        self._tracks: list[_Track] = []
+        self._ids = count(1)
+
+    @classmethod
+    def from_pretrained(cls, model: str | PathLike[str] | None = None, *, device: str = 'auto',
+                        num_threads: int | None = None, **options: Any) -> HandPoseEstimator:
+        """An estimator with trained weights.
+
+        Args:
+            model: name of weights that ship, or path of a checkpoint; None takes the default.
+            device: 'auto', 'cpu', 'cuda' or 'cuda:N'.
+            num_threads: for the network on the CPU; None chooses by the number of cores.
+            options: the other arguments of the class.
+
+        Raises:
+            CheckpointError: there are no such weights, or they are damaged.
+        """
+        checkpoint = load_checkpoint(model)
+        engine = make_engine(checkpoint.network, device=device, num_threads=num_threads, refiner=checkpoint.refiner)
+        options.setdefault('cube_side', checkpoint.metadata['cube_side'])
+        return cls(engine, get_skeleton(checkpoint.metadata['skeleton']), metadata=checkpoint.metadata, **options)
+
+    def reset(self) -> None:
+        """Forget the hands of the last image."""
+        self._tracks.clear()
+
+    def __call__(self, depth: NDArray[np.float32], intrinsics: Intrinsics) -> list[HandEstimate]:
+        """The hands in a depth image, the surest first among those newly found, tracked ones before them.
+
+        Args:
+            depth: (H, W) float32 metres, 0 = no reading.
+            intrinsics: of this very image.
+
+        Raises:
+            InputError: the image is of another type or size than described.
+        """
+        if depth.ndim != 2 or depth.dtype != np.float32:
+            raise InputError(f'a depth image must be (H, W) float32 in metres, not {depth.shape} {depth.dtype}: '
+                             'decode it with hand_pose_ros.depth')
+        intrinsics.check_size(depth.shape[1], depth.shape[0])
+        self.timings = dict.fromkeys(('detect', 'crop', 'predict', 'uncrop'), 0.0)
+
+        hands: list[HandEstimate] = []
+        for track in list(self._tracks):
+            cube = Cube(track.center, self.cube_side)
+            with self._timed('detect'):
+                alive = holds_a_hand(depth, intrinsics, cube, near=self.near, far=self.far)
+            reading = self._read(depth, intrinsics, cube, track) if alive else None
+            if reading is not None and reading.score >= self.min_score and not _overlaps(reading.cube, hands):
+                hands.append(self._follow(track, reading))
+            else:
+                self._tracks.remove(track)
+        if len(hands) < self.max_hands:
+            with self._timed('detect'):
+                # Objects that prove to be no hand must not hide one behind them.
+                cubes = detect(depth, intrinsics, side=self.cube_side, near=self.near, far=self.far,
+                               max_hands=self.max_hands + 2)
+            for cube in cubes:
+                if len(hands) == self.max_hands:
+                    break
+                if _overlaps(cube, hands):
+                    continue
+                track = _Track(id='', center=cube.center)
+                reading = self._read(depth, intrinsics, cube, track)
+                if reading.score >= self.min_score and not _overlaps(reading.cube, hands):
+                    track.id = f'hand_{next(self._ids)}'
+                    self._tracks.append(track)
+                    hands.append(self._follow(track, reading))
+        if not self.tracking:
+            self.reset()
+        return hands
+
+    def _read(self, depth: NDArray[np.float32], intrinsics: Intrinsics, cube: Cube, track: _Track) -> _Reading:
+        """Look into a cube, and once more where the hand really is if that was not the middle of the cube."""
+        reading = self._predict(depth, intrinsics, cube, track)
+        center = reading.joints.mean(axis=0)
+        if np.linalg.norm(center - cube.center) > RECENTER_M and center[2] > self.near:
+            again = self._predict(depth, intrinsics, Cube(tuple(center.tolist()), cube.side), track)
+            if again.score >= reading.score:
+                return again
+        return reading
+
+    def _predict(self, depth: NDArray[np.float32], intrinsics: Intrinsics, cube: Cube, track: _Track) -> _Reading:
+        with self._timed('crop'):
+            patch = crop(depth, cube, intrinsics)
+            # The network knows right hands. A left hand is shown to it in the mirror; of an unknown one, both.
+            as_right, as_left = self.side != 'left', self.side != 'right'
+            patches = np.stack([patch] * as_right + [patch[..., ::-1]] * as_left)
+        with self._timed('predict'):
+            answer = self.engine.run(patches)
+        with self._timed('uncrop'):
+            readings = []
+            for coordinates, shown in zip(answer, patches, strict=True):
+                confidence, score = explain(shown, coordinates, cube.side, self.skeleton)
+                readings.append((coordinates.astype(np.float64), confidence, score))
+            rightness = readings[0][2] - readings[-1][2]
+            best = 0
+            if as_right and as_left and track.rightness + rightness < 0:
+                best = 1
+            coordinates, confidence, score = readings[best]
+            if not as_right or best == 1:
+                coordinates = coordinates * (-1, 1, 1)
+            return _Reading(cube, cube.from_cube(coordinates), confidence, score, rightness)
+
+    def _follow(self, track: _Track, reading: _Reading) -> HandEstimate:
+        track.rightness = SIDE_MEMORY * track.rightness + reading.rightness
+        center = reading.joints.mean(axis=0)
+        track.center = (float(center[0]), float(center[1]), float(center[2]))
+        side: Side = self.side if self.side != 'auto' else 'right' if track.rightness >= 0 else 'left'
+        return HandEstimate(reading.joints.astype(np.float32), self.skeleton.joint_names, reading.confidence,
+                            reading.score, side, reading.cube, track.id)
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.timings[stage] += time.perf_counter() - start
+
+
+def _overlaps(cube: Cube, hands: list[HandEstimate]) -> bool:
+    """Whether a cube looks at a hand that was already found."""
+    return any(np.linalg.norm(np.subtract(cube.center, hand.cube.center)) < cube.side / 3 for hand in hands)

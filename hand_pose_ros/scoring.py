@@ -1,0 +1,72 @@
+"""How well an estimated skeleton explains the depth it came from.
+
+The paper's networks answer with joints and nothing else, whatever they are shown. This geometric check gives them a
+confidence per joint and a score per hand; networks that have learned to judge themselves do not need it.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hand_pose_ros.skeleton import Skeleton
+
+JOINT_TOLERANCE_M = 0.008
+"""How far beside the silhouette, or before the surface, a joint may come to lie: about the radius of a finger."""
+FLESH_M = 0.025
+"""A joint further than this behind the surface is hidden by something else than its own flesh."""
+HIDDEN_CONFIDENCE = 0.5
+"""What a joint is given that nothing speaks for or against."""
+REACH_M = 0.022
+"""Surface further than this from every bone is not explained by the skeleton."""
+
+
+def explain(patch: NDArray[np.float32], joints: NDArray[np.floating], side: float,
+            skeleton: Skeleton) -> tuple[NDArray[np.float32], float]:
+    """Confidence of each joint (J,) and score of the hand, both in [0, 1].
+
+    A joint is inside the hand: on the silhouette and behind the visible surface. And a skeleton that belongs to a hand
+    leaves little of the surface unexplained (that of the forearm, beyond the wrist, excepted). The score is the mean
+    confidence times the share of the surface that is explained.
+
+    Args:
+        patch: (1, S, S) in [-1, 1].
+        joints: (J, 3) in cube units.
+        side: of the cube, metres.
+    """
+    surface = patch[0]
+    size, half = surface.shape[0], side / 2
+    seen = surface < 1
+    if not seen.any():
+        return np.zeros(len(joints), np.float32), 0.0
+    column, row = np.clip(((joints[:, :2] + 1) * size / 2 - 0.5).round().astype(int), 0, size - 1).T
+    beside = cv2.distanceTransform((~seen).view(np.uint8), cv2.DIST_L2, 3)[row, column] * side / size
+    outside = np.maximum(np.abs(joints[:, :2]).max(axis=1) - 1, 0) * half
+    behind = np.where(beside > 0, 0, joints[:, 2] - surface[row, column]) * half
+    miss = np.hypot(beside + outside, np.maximum(-behind, 0)) / JOINT_TOLERANCE_M
+    confidence = np.exp(-0.5 * miss ** 2) * np.where(behind > FLESH_M, HIDDEN_CONFIDENCE, 1)
+    return confidence.astype(np.float32), float(confidence.mean() * _explained(surface[::2, ::2], joints, half, skeleton))
+
+
+def _explained(surface: NDArray[np.float32], joints: NDArray[np.floating], half: float, skeleton: Skeleton) -> float:
+    """Share of the visible surface within reach of a bone, not counting the forearm."""
+    rows, columns = np.nonzero((surface < 1) & (surface > -1))
+    if len(rows) == 0:
+        return 0.0
+    scale = 2 / surface.shape[0]
+    points = np.stack([(columns + 0.5) * scale - 1, (rows + 0.5) * scale - 1, surface[rows, columns]], axis=1)
+    if {'wrist', 'middle_mcp'} <= set(skeleton.joint_names):
+        wrist, knuckle = (joints[skeleton.joint_names.index(name)] for name in ('wrist', 'middle_mcp'))
+        points = points[(points - wrist) @ (knuckle - wrist) > 0]
+        if len(points) == 0:
+            return 0.0
+    parents, children = np.array(skeleton.bones).T
+    start, bone = joints[parents], joints[children] - joints[parents]
+    # |p - (a + t b)|^2 over all points and bones, with t clamped to the bone, from dot products only.
+    along = points @ bone.T - (start * bone).sum(1)
+    length2 = np.maximum((bone ** 2).sum(1), 1e-12)
+    t = np.clip(along / length2, 0, 1)
+    from_start2 = (points ** 2).sum(1)[:, None] - 2 * points @ start.T + (start ** 2).sum(1)
+    distance2 = from_start2 - 2 * t * along + t ** 2 * length2
+    return float((distance2.min(axis=1) < (REACH_M / half) ** 2).mean())

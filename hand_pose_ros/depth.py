@@ -1,0 +1,265 @@
+"""Bytes of a depth image -> depth in metres, float32, where 0 means "no reading".
+
+Understood are the encodings 16UC1, mono16 and 32FC1 (REP-118) of sensor_msgs/Image, the transports
+`compressedDepth` (PNG and RVL) and plain `compressed` (16-bit PNG) of sensor_msgs/CompressedImage, and 16-bit PNG
+files. Messages are taken by their fields: those of rclpy, of a bag reader, or any object with the same attributes.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hand_pose_ros.errors import InputError
+
+DEPTH_ENCODINGS: dict[str, np.dtype[Any]] = {
+    '16UC1': np.dtype('u2'), 'mono16': np.dtype('u2'), '32FC1': np.dtype('f4')}
+"""The encodings that hold depth, and the type of one pixel."""
+
+MAX_PIXELS = 1 << 24
+"""Far above any depth camera: a compressed image that claims more is corrupt and gets no memory."""
+
+_PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
+_HEADER = struct.Struct('<iff')  # compressedDepth: kind of quantisation and its parameters A and B
+_SMALLEST, _LARGEST = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
+
+
+def decode_image(msg: Any, depth_scale: float = 0.001, *, source: str = '') -> NDArray[np.float32]:
+    """Depth (H, W) in metres of a sensor_msgs/Image; 0 = no reading, also for NaN, Inf and negative (REP-117).
+
+    Args:
+        msg: `height`, `width`, `step`, `encoding` (see DEPTH_ENCODINGS), `is_bigendian`, `data` (any buffer).
+        depth_scale: metres per unit of the 16-bit encodings; 32FC1 is in metres already.
+        source: the topic or file, to begin error messages with.
+
+    Raises:
+        InputError: not a depth encoding, an empty image, rows shorter than the width, or less data than rows.
+    """
+    with _naming(source):
+        height, width, step = int(msg.height), int(msg.width), int(msg.step)
+        if msg.encoding not in DEPTH_ENCODINGS:
+            raise InputError(f"the encoding '{msg.encoding}' is not depth: choose a topic with one of "
+                             f'{", ".join(DEPTH_ENCODINGS)}')
+        if height <= 0 or width <= 0:
+            raise InputError(f'the image is empty ({width}x{height} pixels): does the camera stream depth?')
+        pixel = DEPTH_ENCODINGS[msg.encoding].newbyteorder('>' if msg.is_bigendian else '<')
+        if step < width * pixel.itemsize:
+            raise InputError(f'step is {step} bytes but a row of {width} pixels of {msg.encoding} takes '
+                             f'{width * pixel.itemsize}: the publisher must fill in step = bytes per row')
+        data = memoryview(msg.data)
+        if data.nbytes < step * height:
+            raise InputError(f'{data.nbytes} bytes of data are fewer than step x height = {step} x {height}: '
+                             'the image was cut short; check the publisher or the recording')
+        pixels: NDArray[Any] = np.ndarray((height, width), pixel, data, strides=(step, pixel.itemsize))
+        return to_metres(pixels, depth_scale) if pixel.kind == 'u' else _sanitised(pixels)
+
+
+def decode_compressed(msg: Any, depth_scale: float = 0.001, *, source: str = '') -> NDArray[np.float32]:
+    """Depth (H, W) in metres of a sensor_msgs/CompressedImage; 0 = no reading.
+
+    Args:
+        msg: `format` and `data` (any buffer). Formats: `16UC1; compressedDepth png`, `... rvl`, without the
+            codec (png), with nothing after the encoding (png), and `16UC1; png compressed` of the plain
+            `compressed` transport; 32FC1 is inverse depth, quantised to 16 bits.
+        depth_scale: metres per unit of the 16-bit encodings.
+        source: the topic or file, to begin error messages with.
+
+    Raises:
+        InputError: another format, or data that is corrupt.
+    """
+    with _naming(source):
+        words = msg.format.replace(';', ' ').split()
+        encoding = words[0] if words else ''
+        if encoding not in DEPTH_ENCODINGS:
+            raise InputError(f"the format '{msg.format}' is not compressed depth: choose a topic whose format "
+                             f"begins with {', '.join(DEPTH_ENCODINGS)} (such as '16UC1; compressedDepth png')")
+        data = memoryview(msg.data).cast('B')
+        plain = bytes(data[:8]) == _PNG_SIGNATURE  # the `compressed` transport writes no header
+        if DEPTH_ENCODINGS[encoding].kind == 'u':
+            return to_metres(_decode_units(data[0 if plain else _HEADER.size:], words), depth_scale)
+        if plain or len(data) < _HEADER.size:
+            raise InputError(f"the header of the format '{msg.format}' is missing: publish 32FC1 depth with "
+                             'the transport compressedDepth, or as a raw image')
+        _, a, b = _HEADER.unpack_from(data)
+        return _from_inverse_depth(_decode_units(data[_HEADER.size:], words), a, b)
+
+
+def encode_compressed(
+        depth: NDArray[np.float32], codec: str = 'png', depth_scale: float = 0.001) -> tuple[str, bytes]:
+    """`format` and `data` of a 16UC1 sensor_msgs/CompressedImage on a `.../compressedDepth` topic.
+
+    Args:
+        depth: (H, W) in metres, 0 = no reading; see `to_units` for what 16 bits can hold.
+        codec: 'png' (smaller) or 'rvl' (faster to decode in C++ players).
+    """
+    units = to_units(depth, depth_scale)
+    payload = encode_rvl(units) if codec == 'rvl' else encode_png(units)
+    return f'16UC1; compressedDepth {codec}', _HEADER.pack(-1, 0.0, 0.0) + payload
+
+
+def read_png(path: str | Path, depth_scale: float = 0.001) -> NDArray[np.float32]:
+    """Depth (H, W) in metres of a 16-bit greyscale PNG file; 0 = no reading.
+
+    Raises:
+        InputError: the file cannot be read, is not a PNG, is damaged, or has not 16 bits in one channel.
+    """
+    with _naming(str(path)):
+        try:
+            data = Path(path).read_bytes()
+        except OSError as error:
+            raise InputError(f'the file cannot be read ({error.strerror}): check the path') from None
+        return to_metres(_decode_png(memoryview(data)), depth_scale)
+
+
+def to_metres(units: NDArray[np.uint16], depth_scale: float = 0.001) -> NDArray[np.float32]:
+    """Sensor units (H, W) -> metres, float32; `depth_scale` is in metres per unit."""
+    if not 0 < depth_scale < np.inf:
+        raise InputError(f'depth_scale is {depth_scale}: give the metres per unit (0.001 for millimetres)')
+    return np.multiply(units, np.float32(depth_scale), dtype=np.float32)
+
+
+def to_units(depth: NDArray[np.float32], depth_scale: float = 0.001) -> NDArray[np.uint16]:
+    """Metres (H, W) -> the nearest sensor unit; what does not fit into 16 bits becomes 0, "no reading"."""
+    units = np.rint(np.asarray(depth, np.float64) / depth_scale)
+    return np.where((units > 0) & (units <= 0xFFFF), units, 0).astype(np.uint16)
+
+
+def encode_png(units: NDArray[np.uint16]) -> bytes:
+    """Sensor units (H, W) -> a 16-bit greyscale PNG."""
+    return cv2.imencode('.png', units)[1].tobytes()
+
+
+def encode_rvl(units: NDArray[np.uint16]) -> bytes:
+    """Sensor units (H, W) -> RVL (Wilson 2017), behind the width and height as compressedDepth has it.
+
+    The stream is runs of {how many zeros, how many others, the differences of the others}; each of these numbers
+    is cut into groups of 3 bits, low ones first, and each group is a nibble whose bit 8 says that more follow.
+    """
+    flat = np.asarray(units, np.int64).ravel()
+    changes = np.flatnonzero(np.diff(flat != 0, prepend=False)) if flat.size else np.empty(0, np.int64)
+    edges = np.concatenate([[0], changes, [flat.size] * (1 + (len(changes) % 2 == 0))])
+    lengths = np.diff(edges).reshape(-1, 2)  # a row for every run: zeros, others
+    values = flat[flat != 0]
+    delta = np.diff(values, prepend=0)
+    numbers = np.insert((delta << 1) ^ (delta >> 63),
+                        np.repeat(np.concatenate([[0], np.cumsum(lengths[:-1, 1])]), 2), lengths.ravel())
+
+    groups = np.maximum(1, -(-np.ceil(np.log2(numbers + 1)).astype(np.int64) // 3))
+    starts = np.cumsum(groups) - groups
+    nibbles = np.zeros(-(-int(groups.sum()) // 8) * 8, np.uint8)
+    for k in range(int(groups.max())):
+        has = groups > k
+        nibbles[starts[has] + k] = (numbers[has] >> 3 * k & 7) | (groups[has] > k + 1) * 8
+    words = (nibbles[::2] << 4 | nibbles[1::2]).view('>u4').astype('<u4')
+    height, width = units.shape
+    return struct.pack('<II', width, height) + words.tobytes()
+
+
+def decode_rvl(data: bytes | memoryview) -> NDArray[np.uint16]:
+    """The inverse of `encode_rvl`: (H, W) sensor units.
+
+    Raises:
+        InputError: the data is corrupt.
+    """
+    corrupt = 'the RVL data is corrupt ({}): the message was cut short or is of another format'
+    if len(data) < 8:
+        raise InputError(corrupt.format(f'{len(data)} bytes hold no image size'))
+    width, height = struct.unpack_from('<II', data)
+    _check_size(width, height)
+    pixels = width * height
+
+    payload = np.frombuffer(data, np.uint8, offset=8)
+    octets = payload[:len(payload) // 4 * 4].view('<u4').astype('>u4').view(np.uint8)
+    nibbles = np.stack([octets >> 4, octets & 15], axis=1).ravel()
+    ends = np.flatnonzero(nibbles < 8)
+    groups = np.diff(ends, prepend=-1)
+    if len(groups) == 0 or groups.max() > 11:
+        raise InputError(corrupt.format('a number without end'))
+    nibbles = nibbles[:ends[-1] + 1]
+    position = np.arange(len(nibbles)) - np.repeat(ends - groups + 1, groups)
+    numbers = np.add.reduceat((nibbles & 7).astype(np.int64) << 3 * position, ends - groups + 1)
+
+    # Where a run ends is only known when it is reached; all else is done at once.
+    heads: list[int] = []
+    lengths: list[int] = []
+    at = filled = 0
+    while filled < pixels:
+        if at + 2 > len(numbers):
+            raise InputError(corrupt.format(f'it ends after {filled} of {pixels} pixels'))
+        run = numbers.item(at), numbers.item(at + 1)
+        heads.append(at)
+        lengths += run
+        filled += sum(run)
+        at += 2 + run[1]
+    if filled > pixels or at > len(numbers):
+        raise InputError(corrupt.format('a run of pixels leaves the image'))
+    is_value = np.ones(at, bool)
+    is_value[heads] = is_value[np.add(heads, 1)] = False
+    zigzag = numbers[:at][is_value]
+    values = np.cumsum((zigzag >> 1) ^ -(zigzag & 1))
+    if len(values) and not 0 <= values.min() <= values.max() <= 0xFFFF:
+        raise InputError(corrupt.format('a value of more than 16 bits'))
+    units = np.zeros(pixels, np.uint16)
+    units[np.repeat(np.arange(len(lengths)) % 2 == 1, lengths)] = values
+    return units.reshape(height, width)
+
+
+def _decode_units(payload: memoryview, words: list[str]) -> NDArray[np.uint16]:
+    """The 16-bit image that a compressed message carries; the words of its format tell the codec."""
+    return decode_rvl(payload) if 'rvl' in words else _decode_png(payload)
+
+
+def _decode_png(data: memoryview) -> NDArray[np.uint16]:
+    """(H, W) sensor units; the header is checked first, so that a corrupt one cannot claim memory."""
+    if len(data) < 26 or bytes(data[:8]) != _PNG_SIGNATURE or bytes(data[12:16]) != b'IHDR':
+        raise InputError('the data is not a PNG: the file or message was cut short or is of another format')
+    width, height, bits, color = struct.unpack_from('>IIBB', data, 16)
+    if (bits, color) != (16, 0):
+        raise InputError(f'the PNG has {bits} bits per {"colour" if color else "grey value"}, which is not '
+                         'metric depth: record 16-bit greyscale (one channel)')
+    _check_size(width, height)
+    try:
+        units = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        units = None
+    if units is None or units.dtype != np.uint16 or units.shape != (height, width):
+        raise InputError(f'the PNG of {width}x{height} pixels is damaged: record or copy it again')
+    return np.asarray(units, np.uint16)
+
+
+def _check_size(width: int, height: int) -> None:
+    if not 0 < width * height <= MAX_PIXELS:
+        raise InputError(f'the compressed image claims {width}x{height} pixels, which cannot be: '
+                         'the data is corrupt or of another format')
+
+
+def _from_inverse_depth(units: NDArray[np.uint16], a: float, b: float) -> NDArray[np.float32]:
+    """Quantised inverse depth (H, W) -> metres: z = A / (q - B), and q = 0 is no reading."""
+    if not (np.isfinite([a, b]).all() and a > 0):
+        raise InputError(f'inverse depth cannot be quantised with A={a}, B={b}: the header is corrupt')
+    with np.errstate(divide='ignore', over='ignore'):
+        depth = np.float32(a) / (units - np.float32(b))
+    depth[units == 0] = 0
+    return _sanitised(depth)
+
+
+def _sanitised(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """A contiguous copy (H, W) in which everything that is not a positive finite number is 0."""
+    depth = np.ascontiguousarray(depth, np.float32)
+    return np.asarray(cv2.copyTo(depth, cv2.inRange(depth, _SMALLEST, _LARGEST)))
+
+
+@contextmanager
+def _naming(source: str) -> Iterator[None]:
+    """Begin the message of an InputError with the topic or file it is about."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f'{source}: {error}' if source else str(error)) from None

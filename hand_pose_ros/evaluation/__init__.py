@@ -1,0 +1,1 @@
+"""Offline evaluation: metrics, published results, bags, plots and reports."""

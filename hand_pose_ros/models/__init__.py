@@ -1,0 +1,46 @@
+"""The networks, and nothing else: one file per family, one table, checkpoints."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from torch import nn
+
+from hand_pose_ros.errors import HandPoseError
+from hand_pose_ros.models.prior_net import CenterRefiner, Deep, MultiScale, Shallow
+from hand_pose_ros.models.resnet import ResNet
+
+ARCHITECTURES: dict[str, Callable[..., nn.Module]] = {
+    'shallow': Shallow,
+    'deep': Deep,
+    'deep_prior': partial(Deep, bottleneck=30),
+    'multi_scale': MultiScale,
+    'resnet': ResNet,
+    'center_refiner': CenterRefiner,
+}
+
+
+def build(architecture: str, **config: Any) -> nn.Module:
+    """A network with fresh weights, by name; it remembers its `architecture` and its complete `config`.
+
+    Pose networks map patches (B, 1, 128, 128) to joints (B, J, 3) in cube units.
+
+    Raises:
+        HandPoseError: no such architecture, or a value in `config` that it does not take.
+    """
+    if architecture not in ARCHITECTURES:
+        raise HandPoseError(f"unknown architecture '{architecture}': "
+                            f"choose one of {', '.join(ARCHITECTURES)}")
+    make = ARCHITECTURES[architecture]
+    signature = inspect.signature(make)
+    if unknown := sorted(config.keys() - signature.parameters.keys()):
+        raise HandPoseError(f"architecture '{architecture}' does not take {', '.join(unknown)}: "
+                            f"it takes {', '.join(signature.parameters)}")
+    arguments = signature.bind(**config)
+    arguments.apply_defaults()  # a checkpoint must not depend on the defaults of its reader
+    network = make(**arguments.arguments)
+    vars(network).update(architecture=architecture, config=dict(arguments.arguments))
+    return network

@@ -1,0 +1,159 @@
+"""Weights on disk: one safetensors file with everything that is needed to run them. No pickles."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from hand_pose_ros import __version__
+from hand_pose_ros.errors import CheckpointError, HandPoseError
+from hand_pose_ros.models import build
+from hand_pose_ros.skeleton import get_skeleton
+
+WEIGHTS = Path(__file__).resolve().parents[1] / 'weights'
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A network in eval mode with float32 weights on the CPU, the refiner that was trained with it, and what is known.
+
+    `metadata` holds at least architecture, config, skeleton (a name), cube_side (metres) and version.
+    """
+
+    network: nn.Module
+    refiner: nn.Module | None = None
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+
+def available() -> dict[str, Path]:
+    """The checkpoints that ship: name -> file."""
+    return {path.stem: path for path in sorted(WEIGHTS.glob('*.safetensors'))}
+
+
+def save_checkpoint(path: str | Path, network: nn.Module, metadata: dict[str, Any],
+                    refiner: nn.Module | None = None, half: bool = True) -> None:
+    """Write a network (and its refiner), both made by `build`, in one step that cannot leave half a file.
+
+    Args:
+        metadata: 'skeleton' and 'cube_side' [m] are needed; any further key that JSON can hold is kept.
+        half: store the trained weights as float16. Running statistics stay float32: their range is not bounded.
+
+    Raises:
+        CheckpointError: the metadata lacks a key, or a weight is not finite (or does not fit float16).
+    """
+    path = Path(path)
+    if missing := {'skeleton', 'cube_side'} - metadata.keys():
+        raise CheckpointError(f"the metadata of checkpoint {path} lacks {', '.join(sorted(missing))}")
+    described = {**metadata, **_description(network), 'version': __version__}
+    tensors = _tensors('network', network, half)
+    if refiner is not None:
+        described['refiner'] = _description(refiner)
+        tensors |= _tensors('refiner', refiner, half)
+    for name, tensor in tensors.items():
+        if tensor.is_floating_point() and not tensor.isfinite().all():
+            raise CheckpointError(f"checkpoint {path} is not written: '{name}' holds values that are not finite "
+                                  'or too large for float16 (did training diverge?)')
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f'.{path.name}.{os.getpid()}.tmp')
+    try:
+        save_file(tensors, temporary, metadata={'hand_pose_ros': json.dumps(described)})
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def load_checkpoint(name_or_path: str | Path) -> Checkpoint:
+    """A checkpoint that ships, by name, or any other, by path.
+
+    Raises:
+        CheckpointError: unknown name; missing, damaged or foreign file; weights that do not fit their own description.
+    """
+    path = _locate(name_or_path)
+    metadata, tensors = _read(path)
+    network = _restore(path, 'network', metadata, tensors)
+    refiner = _restore(path, 'refiner', metadata['refiner'], tensors) if 'refiner' in metadata else None
+    for part in (metadata, metadata.get('refiner', {})):
+        joints = part.get('config', {}).get('joints')
+        try:
+            skeleton = get_skeleton(metadata['skeleton'])
+        except HandPoseError as error:
+            raise CheckpointError(f'checkpoint {path}: {error}') from error
+        if joints not in (None, len(skeleton)):
+            raise CheckpointError(f"checkpoint {path} predicts {joints} joints, "
+                                  f"but its skeleton '{skeleton.name}' has {len(skeleton)}")
+    return Checkpoint(network, refiner, metadata)
+
+
+def _description(network: nn.Module) -> dict[str, Any]:
+    return {key: vars(network)[key] for key in ('architecture', 'config')}
+
+
+def _tensors(part: str, network: nn.Module, half: bool) -> dict[str, Tensor]:
+    weights = {name for name, _ in network.named_parameters()}
+    return {f'{part}.{name}': (tensor.half() if half and name in weights else tensor).contiguous().cpu()
+            for name, tensor in network.state_dict().items()}
+
+
+def _locate(name_or_path: str | Path) -> Path:
+    name = str(name_or_path)
+    if name in (shipped := available()):
+        return shipped[name]
+    path = Path(name_or_path).expanduser()
+    if path.is_file():
+        return path
+    if path.suffix or os.sep in name:
+        raise CheckpointError(f'there is no checkpoint file {path}')
+    raise CheckpointError(f"there is no checkpoint named '{name}': the ones that ship are "
+                          f"{', '.join(shipped) or 'none yet'}; or give the path of a .safetensors file")
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    with open(path, 'rb') as file:
+        start = file.read(4)
+    if start[:1] == b'\x80' or start == b'PK\x03\x04':  # a pickle, or the zip with a pickle that torch.save writes
+        raise CheckpointError(f'{path} is a pickle, which can run code when it is read: only .safetensors are read')
+    try:
+        with safe_open(path, framework='pt') as file:
+            header = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise CheckpointError(f'checkpoint {path} is damaged or no safetensors file ({error}): '
+                              'copy or download it again') from error
+    try:
+        metadata = json.loads(header['hand_pose_ros'])
+        missing = {'architecture', 'config', 'skeleton', 'cube_side'} - metadata.keys()
+    except (KeyError, ValueError, AttributeError) as error:
+        raise CheckpointError(f'{path} was not written by hand_pose_ros: it does not say which network '
+                              'its weights belong to') from error
+    if missing:
+        raise CheckpointError(f"checkpoint {path} does not say its {', '.join(sorted(missing))}")
+    return metadata, tensors
+
+
+def _restore(path: Path, part: str, description: dict[str, Any], tensors: dict[str, Tensor]) -> nn.Module:
+    try:
+        network = build(description['architecture'], **description['config'])
+    except (HandPoseError, TypeError, KeyError) as error:
+        raise CheckpointError(f'checkpoint {path}: {error} (was it written by a newer version? '
+                              f'this is {__version__})') from error
+    own = {name.removeprefix(f'{part}.'): tensor for name, tensor in tensors.items() if name.startswith(f'{part}.')}
+    expected = network.state_dict()
+    for name, tensor in expected.items():
+        if name not in own:
+            raise CheckpointError(f"checkpoint {path} lacks the weights '{name}' of its {part}")
+        if own[name].shape != tensor.shape:
+            raise CheckpointError(f"checkpoint {path} holds '{name}' of its {part} as {tuple(own[name].shape)} "
+                                  f'instead of {tuple(tensor.shape)}')
+        if not own[name].isfinite().all():
+            raise CheckpointError(f"checkpoint {path} is damaged: '{name}' of its {part} is not finite")
+    if unknown := own.keys() - expected.keys():
+        raise CheckpointError(f"checkpoint {path} holds weights that its {part} has no place for: {sorted(unknown)[0]}")
+    network.load_state_dict(own)  # copies into float32
+    return network.requires_grad_(False).eval()

@@ -1,0 +1,124 @@
+"""The pose prior: principal components of hand poses, and the head of a network that holds them (paper, 3.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor, nn
+
+from hand_pose_ros.errors import HandPoseError
+
+
+@dataclass(frozen=True)
+class PosePrior:
+    """A linear model of poses in cube units (x, y, z joint by joint): pose = coefficients @ components + mean."""
+
+    mean: NDArray[np.float64]
+    """(3J,)"""
+    components: NDArray[np.float64]
+    """(k, 3J), orthonormal rows, the largest variance first."""
+    explained_variance_ratio: NDArray[np.float64]
+    """(k,), the share of the total variance along each component."""
+
+    def project(self, poses: ArrayLike) -> NDArray[np.float64]:
+        """Poses (..., 3J) -> coefficients (..., k)."""
+        return (np.asarray(poses) - self.mean) @ self.components.T
+
+    def reconstruct(self, coefficients: ArrayLike) -> NDArray[np.float64]:
+        """Coefficients (..., k) -> poses (..., 3J)."""
+        return np.asarray(coefficients) @ self.components + self.mean
+
+
+def fit_prior(poses: ArrayLike, components: int = 30) -> PosePrior:
+    """Principal component analysis: centred, not whitened.
+
+    Args:
+        poses: (N, 3J) or (N, J, 3), in cube units.
+        components: how many to keep; the paper finds 30 best.
+
+    Raises:
+        HandPoseError: fewer poses or coordinates than components, or a pose that is not finite.
+    """
+    poses = np.asarray(poses, np.float64)
+    poses = poses.reshape(len(poses), -1)
+    if min(poses.shape) < components:
+        raise HandPoseError(f'{components} components need at least as many poses and coordinates, '
+                            f'but there are {poses.shape[0]} poses of {poses.shape[1]} coordinates')
+    if not np.isfinite(poses).all():
+        raise HandPoseError('the poses for the prior hold values that are not finite')
+    mean = poses.mean(0)
+    # The covariance is 3J x 3J however many poses there are: a million cost no more memory than their own.
+    centred = poses - mean
+    variance, vectors = np.linalg.eigh(centred.T @ centred)
+    variance, vectors = variance[::-1].clip(min=0), vectors[:, ::-1].T
+    kept = vectors[:components]
+    # An eigenvector has no sign of its own: make its largest entry positive, so that two machines agree.
+    kept = kept * np.sign(kept[np.arange(components), np.abs(kept).argmax(1)])[:, None]
+    return PosePrior(mean, kept, variance[:components] / max(variance.sum(), np.finfo(float).tiny))
+
+
+class PoseHead(nn.Module):
+    """Fully connected layers from features to joints, directly or through the prior.
+
+    features -> [hidden, ReLU, dropout] ... -> joints, or -> `bottleneck` coefficients -> reconstruction -> joints.
+    The reconstruction is an ordinary linear layer that starts from the principal components (`set_prior`) and is
+    trained on.
+    """
+
+    def __init__(self, features: int, joints: int, bottleneck: int | None, hidden: Sequence[int],
+                 dropout: float) -> None:
+        super().__init__()
+        self.joints = joints
+        layers: list[nn.Module] = []
+        for width in hidden:
+            layers += [relu_linear(features, width), nn.ReLU(), nn.Dropout(dropout)]
+            features = width
+        self.hidden = nn.Sequential(*layers)
+        self.output = plain_linear(features, bottleneck or 3 * joints)
+        self.reconstruction = plain_linear(bottleneck, 3 * joints) if bottleneck else None
+
+    def set_prior(self, mean: ArrayLike, components: ArrayLike) -> None:
+        """Start the reconstruction from mean (3J,) and components (k, 3J), k = the bottleneck."""
+        if self.reconstruction is None:
+            raise HandPoseError('a network without a bottleneck regresses joints directly and takes no prior')
+        weight, bias = (torch.as_tensor(np.asarray(a), dtype=torch.float32) for a in (components, mean))
+        if weight.T.shape != self.reconstruction.weight.shape or bias.shape != self.reconstruction.bias.shape:
+            raise HandPoseError(f'a prior with components {tuple(weight.shape)} and mean {tuple(bias.shape)} does '
+                                f'not fit a bottleneck of {self.output.out_features} and {self.joints} joints')
+        with torch.no_grad():
+            self.reconstruction.weight.copy_(weight.T)
+            self.reconstruction.bias.copy_(bias)
+
+    def forward(self, features: Tensor) -> Tensor:  # (B, F) -> (B, J, 3)
+        output = self.output(self.hidden(features))
+        if self.reconstruction is not None:
+            output = self.reconstruction(output)
+        return output.view(-1, self.joints, 3)
+
+
+def relu_conv(inputs: int, outputs: int, size: int, stride: int = 1, padding: int = 0) -> nn.Conv2d:
+    """A convolution before a ReLU: N(0, sqrt(2 / fan_in)), zero bias (He et al. 2015)."""
+    layer = nn.Conv2d(inputs, outputs, size, stride, padding)
+    nn.init.kaiming_normal_(layer.weight, nonlinearity='relu')
+    nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
+    return layer
+
+
+def relu_linear(inputs: int, outputs: int) -> nn.Linear:
+    """A fully connected layer before a ReLU: N(0, 0.01), zero bias (original code)."""
+    layer = nn.Linear(inputs, outputs)
+    nn.init.normal_(layer.weight, std=0.01)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+def plain_linear(inputs: int, outputs: int) -> nn.Linear:
+    """A fully connected layer without a ReLU: uniform (Glorot and Bengio 2010), zero bias (original code)."""
+    layer = nn.Linear(inputs, outputs)
+    nn.init.xavier_uniform_(layer.weight)
+    nn.init.zeros_(layer.bias)
+    return layer

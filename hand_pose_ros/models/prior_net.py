@@ -1,0 +1,106 @@
+"""The networks of "Hands Deep in Deep Learning for Hand Pose Estimation" (Oberweger et al. 2015, section 3).
+
+Every network maps patches (B, 1, 128, 128) in [-1, 1] to joints (B, J, 3) in cube units, directly or, with a
+`bottleneck`, through the pose prior. Convolutions are "valid", pooling does not overlap and drops what does not
+fill a window. Where the paper's text gives no figure, the value is a default of ours and says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+import torch.nn.functional as F
+from numpy.typing import ArrayLike
+from torch import Tensor, nn
+
+from hand_pose_ros.geometry import PATCH_SIZE
+from hand_pose_ros.models.prior import PoseHead, relu_conv
+
+
+class PoseNetwork(nn.Module):
+    """Features, then a head with or without the prior."""
+
+    def __init__(self, features: nn.Module, joints: int, bottleneck: int | None,
+                 hidden: tuple[int, ...] = (1024, 1024), dropout: float = 0.3) -> None:
+        super().__init__()
+        self.features = features
+        with torch.no_grad():
+            flat = features(torch.zeros(1, 1, PATCH_SIZE, PATCH_SIZE)).shape[1]
+        self.head = PoseHead(flat, joints, bottleneck, hidden, dropout)
+
+    def set_prior(self, mean: ArrayLike, components: ArrayLike) -> None:
+        """Start the reconstruction from a mean (3J,) and components (bottleneck, 3J): see `fit_prior`."""
+        self.head.set_prior(mean, components)
+
+    def forward(self, patch: Tensor) -> Tensor:
+        """(B, 1, 128, 128) in [-1, 1] -> (B, J, 3) in cube units."""
+        return self.head(self.features(patch))
+
+
+class Shallow(PoseNetwork):
+    """One convolution, one pooling, one hidden layer. The sizes are ours: the paper has them only in a figure."""
+
+    def __init__(self, joints: int = 21, bottleneck: int | None = None, dropout: float = 0.3) -> None:
+        features = nn.Sequential(_convolution(1, 8, 5, pool=4), nn.Flatten())  # (8, 31, 31) = 7688
+        super().__init__(features, joints, bottleneck, hidden=(1024,), dropout=dropout)
+
+
+class Deep(PoseNetwork):
+    """Three convolutions and two hidden layers (original code); with a bottleneck of 30 it is Deep-Prior."""
+
+    def __init__(self, joints: int = 21, bottleneck: int | None = None, dropout: float = 0.3) -> None:
+        super().__init__(nn.Sequential(*deep_branch((4, 2, 1))), joints, bottleneck, dropout=dropout)
+
+
+class MultiScale(PoseNetwork):
+    """Three branches over the patch at full, half and quarter resolution (layer sizes: original code)."""
+
+    def __init__(self, joints: int = 21, bottleneck: int | None = None, dropout: float = 0.3) -> None:
+        super().__init__(_Branches(_pyramid), joints, bottleneck, dropout=dropout)
+
+
+class CenterRefiner(PoseNetwork):
+    """Where the palm is in the cube (DeepPrior++): the branches of `MultiScale` over central crops."""
+
+    def __init__(self, dropout: float = 0.3) -> None:
+        super().__init__(_Branches(_central_crops), joints=1, bottleneck=None, dropout=dropout)
+
+    def forward(self, patch: Tensor) -> Tensor:
+        """(B, 1, 128, 128) in [-1, 1] -> (B, 3): where the palm is, in cube units."""
+        return super().forward(patch)[:, 0]
+
+
+class _Branches(nn.Module):
+    """One branch for each of three views of the patch, 128, 64 and 32 pixels wide."""
+
+    def __init__(self, views: Callable[[Tensor], tuple[Tensor, ...]]) -> None:
+        super().__init__()
+        self.views = views
+        self.branches = nn.ModuleList(
+            nn.Sequential(*deep_branch(pools)) for pools in ((4, 2, 1), (2, 2, 1), (2, 1, 1)))
+
+    def forward(self, patch: Tensor) -> Tensor:  # (B, 1, 128, 128) -> (B, 968 + 968 + 512)
+        views = self.views(patch)
+        return torch.cat([branch(view) for branch, view in zip(self.branches, views, strict=True)], dim=1)
+
+
+def _pyramid(patch: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    half = F.avg_pool2d(patch, 2)  # what bilinear interpolation makes of an exact half
+    return patch, half, F.avg_pool2d(half, 2)
+
+
+def _central_crops(patch: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    return patch, patch[..., 32:96, 32:96], patch[..., 48:80, 48:80]
+
+
+def deep_branch(pools: tuple[int, int, int]) -> list[nn.Module]:
+    """The convolutions of Deep: 8@5x5, 8@5x5, 8@3x3, each pooled and rectified, then flattened."""
+    sizes = zip((1, 8, 8), (5, 5, 3), pools, strict=True)
+    return [*(_convolution(inputs, 8, size, pool) for inputs, size, pool in sizes), nn.Flatten()]
+
+
+def _convolution(inputs: int, outputs: int, size: int, pool: int) -> nn.Sequential:
+    """Convolution, pooling, ReLU. The bias commutes with max-pooling, so adding it before changes nothing."""
+    pooling = [nn.MaxPool2d(pool)] if pool > 1 else []
+    return nn.Sequential(relu_conv(inputs, outputs, size), *pooling, nn.ReLU())

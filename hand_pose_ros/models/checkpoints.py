@@ -22,7 +22,7 @@ WEIGHTS = Path(__file__).resolve().parents[1] / 'weights'
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A network in eval mode with float32 weights on the CPU, the refiner that was trained with it, and what is known.
+    """A network with its refiner, in eval mode, float32, on the CPU, and what is known about them.
 
     `metadata` holds at least architecture, config, skeleton (a name), cube_side (metres) and version.
     """
@@ -43,7 +43,7 @@ def save_checkpoint(path: str | Path, network: nn.Module, metadata: dict[str, An
 
     Args:
         metadata: 'skeleton' and 'cube_side' [m] are needed; any further key that JSON can hold is kept.
-        half: store the trained weights as float16. Running statistics stay float32: their range is not bounded.
+        half: store the trained weights as float16. Running statistics, whose range is open, stay float32.
 
     Raises:
         CheckpointError: the metadata lacks a key, or a weight is not finite (or does not fit float16).
@@ -58,8 +58,8 @@ def save_checkpoint(path: str | Path, network: nn.Module, metadata: dict[str, An
         tensors |= _tensors('refiner', refiner, half)
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not tensor.isfinite().all():
-            raise CheckpointError(f"checkpoint {path} is not written: '{name}' holds values that are not finite "
-                                  'or too large for float16 (did training diverge?)')
+            raise CheckpointError(f"checkpoint {path} is not written: '{name}' holds values that are "
+                                  'not finite or too large for float16 (did training diverge?)')
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f'.{path.name}.{os.getpid()}.tmp')
     try:
@@ -73,7 +73,7 @@ def load_checkpoint(name_or_path: str | Path) -> Checkpoint:
     """A checkpoint that ships, by name, or any other, by path.
 
     Raises:
-        CheckpointError: unknown name; missing, damaged or foreign file; weights that do not fit their own description.
+        CheckpointError: unknown name; missing, damaged or foreign file; weights that do not fit the network.
     """
     path = _locate(name_or_path)
     metadata, tensors = _read(path)
@@ -117,8 +117,8 @@ def _locate(name_or_path: str | Path) -> Path:
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     with open(path, 'rb') as file:
         start = file.read(4)
-    if start[:1] == b'\x80' or start == b'PK\x03\x04':  # a pickle, or the zip with a pickle that torch.save writes
-        raise CheckpointError(f'{path} is a pickle, which can run code when it is read: only .safetensors are read')
+    if start[:1] == b'\x80' or start == b'PK\x03\x04':  # a pickle, or a zip around one (torch.save)
+        raise CheckpointError(f'{path} is a pickle, which can run code when read: only .safetensors are accepted')
     try:
         with safe_open(path, framework='pt') as file:
             header = file.metadata() or {}
@@ -143,17 +143,18 @@ def _restore(path: Path, part: str, description: dict[str, Any], tensors: dict[s
     except (HandPoseError, TypeError, KeyError) as error:
         raise CheckpointError(f'checkpoint {path}: {error} (was it written by a newer version? '
                               f'this is {__version__})') from error
-    own = {name.removeprefix(f'{part}.'): tensor for name, tensor in tensors.items() if name.startswith(f'{part}.')}
+    prefix = f'{part}.'
+    own = {name[len(prefix):]: tensor for name, tensor in tensors.items() if name.startswith(prefix)}
     expected = network.state_dict()
     for name, tensor in expected.items():
         if name not in own:
             raise CheckpointError(f"checkpoint {path} lacks the weights '{name}' of its {part}")
         if own[name].shape != tensor.shape:
-            raise CheckpointError(f"checkpoint {path} holds '{name}' of its {part} as {tuple(own[name].shape)} "
-                                  f'instead of {tuple(tensor.shape)}')
+            raise CheckpointError(f"checkpoint {path} holds '{name}' of its {part} as "
+                                  f'{tuple(own[name].shape)} instead of {tuple(tensor.shape)}')
         if not own[name].isfinite().all():
             raise CheckpointError(f"checkpoint {path} is damaged: '{name}' of its {part} is not finite")
     if unknown := own.keys() - expected.keys():
-        raise CheckpointError(f"checkpoint {path} holds weights that its {part} has no place for: {sorted(unknown)[0]}")
+        raise CheckpointError(f"checkpoint {path} holds '{min(unknown)}', which its {part} has no place for")
     network.load_state_dict(own)  # copies into float32
     return network.requires_grad_(False).eval()

@@ -1,4 +1,4 @@
-"""The pose prior: principal components of hand poses, and the head of a network that holds them (paper, 3.2)."""
+"""The pose prior: principal components of poses, and the head of a network that holds them (paper, 3.2)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hand_pose_ros.errors import HandPoseError
 
 @dataclass(frozen=True)
 class PosePrior:
-    """A linear model of poses in cube units (x, y, z joint by joint): pose = coefficients @ components + mean."""
+    """A linear model of poses in cube units (x, y, z by joint): pose = coefficients @ components + mean."""
 
     mean: NDArray[np.float64]
     """(3J,)"""
@@ -64,9 +64,9 @@ def fit_prior(poses: ArrayLike, components: int = 30) -> PosePrior:
 class PoseHead(nn.Module):
     """Fully connected layers from features to joints, directly or through the prior.
 
-    features -> [hidden, ReLU, dropout] ... -> joints, or -> `bottleneck` coefficients -> reconstruction -> joints.
-    The reconstruction is an ordinary linear layer that starts from the principal components (`set_prior`) and is
-    trained on.
+    features -> [hidden, ReLU, dropout] ... -> joints, or -> `bottleneck` coefficients -> reconstruction.
+    The reconstruction is an ordinary linear layer that starts from the principal components (`set_prior`)
+    and is trained on.
     """
 
     def __init__(self, features: int, joints: int, bottleneck: int | None, hidden: Sequence[int],
@@ -87,8 +87,9 @@ class PoseHead(nn.Module):
             raise HandPoseError('a network without a bottleneck regresses joints directly and takes no prior')
         weight, bias = (torch.as_tensor(np.asarray(a), dtype=torch.float32) for a in (components, mean))
         if weight.T.shape != self.reconstruction.weight.shape or bias.shape != self.reconstruction.bias.shape:
-            raise HandPoseError(f'a prior with components {tuple(weight.shape)} and mean {tuple(bias.shape)} does '
-                                f'not fit a bottleneck of {self.output.out_features} and {self.joints} joints')
+            raise HandPoseError(
+                f'a prior with components {tuple(weight.shape)} and mean {tuple(bias.shape)} does not fit '
+                f'a bottleneck of {self.output.out_features} and {self.joints} joints')
         with torch.no_grad():
             self.reconstruction.weight.copy_(weight.T)
             self.reconstruction.bias.copy_(bias)

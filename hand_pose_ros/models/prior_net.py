@@ -1,8 +1,8 @@
 """The networks of "Hands Deep in Deep Learning for Hand Pose Estimation" (Oberweger et al. 2015, section 3).
 
 Every network maps patches (B, 1, 128, 128) in [-1, 1] to joints (B, J, 3) in cube units, directly or, with a
-`bottleneck`, through the pose prior. Convolutions are "valid", pooling does not overlap and drops what does not
-fill a window. Where the paper's text gives no figure, the value is a default of ours and says so.
+`bottleneck`, through the pose prior. Convolutions are "valid"; pooling does not overlap and drops what does
+not fill a window. Where the paper's text gives no figure, the value is a default of ours and says so.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class PoseNetwork(nn.Module):
 
 
 class Shallow(PoseNetwork):
-    """One convolution, one pooling, one hidden layer. The sizes are ours: the paper has them only in a figure."""
+    """One convolution, one pooling, one hidden layer. The sizes are ours: the paper gives no figures."""
 
     def __init__(self, joints: int = 21, bottleneck: int | None = None, dropout: float = 0.3) -> None:
         features = nn.Sequential(_convolution(1, 8, 5, pool=4), nn.Flatten())  # (8, 31, 31) = 7688

@@ -1,4 +1,4 @@
-"""DeepPrior++ (Oberweger and Lepetit 2017): a residual network with pre-activation, bottlenecks and the prior."""
+"""DeepPrior++ (Oberweger and Lepetit 2017): a pre-activation bottleneck residual network with the prior."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class ResNet(PoseNetwork):
 
 
 class _Block(nn.Module):
-    """norm-ReLU-1x1-norm-ReLU-3x3-norm-ReLU-1x1 plus the identity, or plus a 1x1 projection of the first ReLU."""
+    """norm-ReLU-1x1-norm-ReLU-3x3-norm-ReLU-1x1 plus the identity, or a 1x1 projection of the first ReLU."""
 
     def __init__(self, inputs: int, outputs: int, stride: int) -> None:
         super().__init__()

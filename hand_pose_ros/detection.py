@@ -16,8 +16,8 @@ MIN_AREA_M2 = 15e-4
 """What is smaller than this, seen from the camera, is a speck or a cable: a fist seen end on has about 40 cm2."""
 MIN_CUBE_AREA_M2 = 25e-4
 """A cube must hold at least this much surface to hold a hand."""
-MAX_BORDER = 0.6
-"""Share of the cube's outline that may be covered: an arm leaves through one side, a table or a wall through all."""
+MAX_THROUGH = 0.5
+"""Share of two opposite sides that may both be cut: an arm leaves through one side, a table or a wall goes through."""
 
 _WORK_WIDTH = 160
 _SLAB_M = 0.03
@@ -65,7 +65,7 @@ def detect(depth: NDArray[np.float32], intrinsics: Intrinsics, *, side: float = 
 
     Starting at the camera, everything nearer than a growing distance is looked at. The first connected piece of at
     least MIN_AREA_M2 starts a cube, which moves to the centre of mass of what it holds (5 iterations, as the original
-    code does). A cube that holds too little, or that is cut through all around as by a wall or a table, is no hand.
+    code does). A cube that holds too little, or that something goes right through, as a wall or a table does, is no hand.
 
     Args:
         depth: (H, W) float32 metres, 0 = no reading.
@@ -74,12 +74,12 @@ def detect(depth: NDArray[np.float32], intrinsics: Intrinsics, *, side: float = 
     """
     scene = _Scene(depth, intrinsics, near, far)
     found: list[Cube] = []
-    z = scene.z
-    present = z[z > 0]
+    z, unseen = scene.z, scene.z > 0
+    present = z[unseen]
     if present.size == 0:
         return found
     for limit in np.arange(present.min() + _SLAB_M, present.max() + _SLAB_M, _SLAB_M):
-        count, labels, stats, _ = cv2.connectedComponentsWithStats(((z > 0) & (z < limit)).view(np.uint8), connectivity=4)
+        count, labels, stats, _ = cv2.connectedComponentsWithStats((unseen & (z < limit)).view(np.uint8), connectivity=4)
         for label in range(1, count):
             # Nearly all pieces are specks: their number of pixels at the limit bounds their area from above.
             if stats[label, cv2.CC_STAT_AREA] * scene.pixel_area * limit ** 2 < MIN_AREA_M2:
@@ -88,12 +88,13 @@ def detect(depth: NDArray[np.float32], intrinsics: Intrinsics, *, side: float = 
             if float(np.sum(np.square(z[piece]))) * scene.pixel_area < MIN_AREA_M2:
                 continue
             center = _settle(scene, scene.centroid(z, piece, slice(None), slice(None)), side)
-            if _may_hold_a_hand(scene, center, side):
+            again = any(np.linalg.norm(center - cube.center) < side / 3 for cube in found)
+            if not again and _may_hold_a_hand(scene, center, side):
                 found.append(Cube((float(center[0]), float(center[1]), float(center[2])), side))
             # Whatever it was, it has been judged: look behind and beside it.
-            depth_in, inside, rows, cols = scene.inside(center, side)
-            z[rows, cols][inside] = 0
-            z[piece] = 0
+            _, inside, rows, cols = scene.inside(center, side)
+            unseen[rows, cols] &= ~inside
+            unseen[piece] = False
             if len(found) == max_hands:
                 return found
     return found
@@ -113,8 +114,8 @@ def _may_hold_a_hand(scene: _Scene, center: NDArray[np.float64], side: float) ->
     z, inside, _, _ = scene.inside(center, side)
     if float(np.sum(np.square(z[inside]))) * scene.pixel_area < MIN_CUBE_AREA_M2:
         return False
-    outline = np.concatenate([inside[0], inside[-1], inside[1:-1, 0], inside[1:-1, -1]])
-    return bool(outline.mean() <= MAX_BORDER)
+    through = max(min(inside[0].mean(), inside[-1].mean()), min(inside[:, 0].mean(), inside[:, -1].mean()))
+    return bool(through <= MAX_THROUGH)
 
 
 def holds_a_hand(depth: NDArray[np.float32], intrinsics: Intrinsics, cube: Cube, *, near: float = 0.1,

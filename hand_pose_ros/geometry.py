@@ -132,7 +132,9 @@ def crop(depth: NDArray[np.float32], cube: Cube, intrinsics: Intrinsics, size: i
                        [0, intrinsics.fy * step, v + intrinsics.fy * step * (0.5 - size / 2)]])
     patch = cv2.warpAffine(depth, affine, (size, size), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
                            borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-    patch[patch == 0] = z + half
+    nothing = patch == 0
     patch -= z
     patch /= half
-    return np.clip(patch, -1, 1, out=patch)[None]
+    np.clip(patch, -1, 1, out=patch)
+    patch[nothing] = 1
+    return patch[None]

@@ -1,0 +1,124 @@
+"""The camera, the cube and the crop: exact inverses, and values that mean what they say."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hand_pose_ros.errors import InputError
+from hand_pose_ros.geometry import Cube, Intrinsics, crop
+
+VGA = Intrinsics(588.03, 587.07, 320.0, 240.0, 640, 480)
+
+
+def camera_info(**changes):
+    info = SimpleNamespace(width=640, height=480, k=[500.0, 0, 320, 0, 510, 240, 0, 0, 1], p=[0.0] * 12, binning_x=0, binning_y=0,
+                           roi=SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0))
+    for name, value in changes.items():
+        setattr(info, name, value)
+    return info
+
+
+cubes = st.builds(lambda x, y, z, side: Cube((x * z, y * z, z), side),
+                  st.floats(-0.5, 0.5), st.floats(-0.4, 0.4), st.floats(0.25, 1.5), st.floats(0.15, 0.4))
+offsets = st.tuples(*[st.floats(-0.5, 0.5)] * 3)
+
+
+@given(cubes, offsets)
+def test_a_joint_survives_crop_and_uncrop(cube, offset):
+    joint = np.add(cube.center, np.multiply(offset, cube.side))
+    back = cube.from_cube(cube.to_cube(joint))
+    assert np.abs(back - joint).max() < 1e-5  # 0.01 mm
+
+
+@given(cubes, offsets)
+def test_cube_units_are_pixels_of_the_patch(cube, offset):
+    joint = np.add(cube.center, np.multiply(offset, cube.side))
+    column, row, depth = cube.to_cube(joint)
+    pixel, middle = VGA.project(joint), VGA.project(cube.center)
+    half = cube.side / 2 / cube.center[2]
+    assert pixel - middle == pytest.approx([column * half * VGA.fx, row * half * VGA.fy], abs=1e-6)
+    assert depth == pytest.approx((joint[2] - cube.center[2]) / (cube.side / 2))
+
+
+@given(st.lists(st.floats(-1, 1), min_size=2, max_size=2), st.floats(0.1, 5))
+def test_projection_and_back_projection_are_inverse(xy, z):
+    point = np.array([*xy, z])
+    assert VGA.back_project(VGA.project(point), z) == pytest.approx(point, abs=1e-9)
+
+
+def test_a_point_right_of_and_below_the_axis_projects_right_and_down():
+    u, v = VGA.project([0.1, 0.2, 1.0])
+    assert u == pytest.approx(320 + 58.803) and v == pytest.approx(240 + 117.414)
+
+
+@given(cubes, st.integers(0, 2 ** 32 - 1))
+def test_a_patch_is_within_minus_one_and_one_whatever_the_depth(cube, seed):
+    depth = np.random.default_rng(seed).choice(np.array([0, 0.2, 0.6, 1.0, 9.0], np.float32), (480, 640))
+    patch = crop(depth, cube, VGA)
+    assert patch.shape == (1, 128, 128) and patch.dtype == np.float32
+    assert patch.min() >= -1 and patch.max() <= 1
+
+
+@pytest.mark.parametrize(('reading', 'value'), [
+    (0.0, 1.0),     # no reading
+    (0.8, 1.0),     # behind the back face
+    (0.65, 1.0),    # on the back face
+    (0.575, 0.5), (0.5, 0.0), (0.425, -0.5),
+    (0.2, -1.0),    # before the front face
+])
+def test_what_a_patch_shows_of_a_plane(reading, value):
+    depth = np.full((480, 640), reading, np.float32)
+    patch = crop(depth, Cube((0, 0, 0.5), 0.3), VGA)
+    assert np.allclose(patch, value, atol=1e-6)
+
+
+def test_outside_the_image_is_background():
+    depth = np.full((480, 640), 0.5, np.float32)
+    x = (0 - 320) / 588.03 * 0.5
+    patch = crop(depth, Cube((x, 0, 0.5), 0.3), VGA)[0]
+    assert (patch[:, :63] == 1).all() and (patch[:, 65:] == 0).all()
+
+
+def test_a_patch_shows_a_joint_where_cube_units_say():
+    cube = Cube((0.05, -0.03, 0.6), 0.3)
+    depth = np.zeros((480, 640), np.float32)
+    joint = np.array([0.1, 0.02, 0.62])
+    u, v = VGA.project(joint).round().astype(int)
+    depth[v - 1:v + 2, u - 1:u + 2] = joint[2]
+    rows, columns = np.nonzero(crop(depth, cube, VGA)[0] < 1)
+    assert len(rows)
+    column, row, _ = (cube.to_cube(joint) + 1) * 64 - 0.5
+    assert columns.mean() == pytest.approx(column, abs=1) and rows.mean() == pytest.approx(row, abs=1)
+
+
+def test_raw_and_rectified_intrinsics():
+    p = [400.0, 0, 310, 0, 0, 410, 230, 0, 0, 0, 1, 0]
+    assert Intrinsics.from_camera_info(camera_info(p=p)) == Intrinsics(400, 410, 310, 230, 640, 480)
+    assert Intrinsics.from_camera_info(camera_info(p=p), rectified=False) == Intrinsics(500, 510, 320, 240, 640, 480)
+    assert Intrinsics.from_camera_info(camera_info()) == Intrinsics(500, 510, 320, 240, 640, 480)  # P not filled in
+
+
+def test_binning_and_region_of_interest():
+    roi = SimpleNamespace(x_offset=100, y_offset=40, width=400, height=200)
+    assert (Intrinsics.from_camera_info(camera_info(roi=roi, binning_x=2, binning_y=2))
+            == Intrinsics(250, 255, 110, 100, 200, 100))
+
+
+@pytest.mark.parametrize('changes', [{'k': [0.0] * 9}, {'width': 0}, {'k': [float('nan')] * 9}, {'k': [-1.0] * 9}])
+def test_unusable_camera_info_is_refused(changes):
+    with pytest.raises(InputError, match='camera'):
+        Intrinsics.from_camera_info(camera_info(**changes))
+
+
+def test_intrinsics_of_another_image_are_refused():
+    with pytest.raises(InputError, match='320x240.*640x480'):
+        VGA.check_size(320, 240)
+
+
+@pytest.mark.parametrize(('center', 'side'), [((0, 0, 0), 0.3), ((0, 0, -1), 0.3), ((0, 0, 1), 0), ((np.nan, 0, 1), 0.3)])
+def test_a_cube_behind_the_camera_is_refused(center, side):
+    with pytest.raises(InputError, match='cube'):
+        Cube(center, side)

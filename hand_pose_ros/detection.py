@@ -44,13 +44,15 @@ class _Scene:
         rows = np.searchsorted(self.y, [(y - half) / z, (y + half) / z])
         return slice(*rows), slice(*cols)
 
-    def inside(self, center: NDArray[np.float64], side: float) -> tuple[NDArray[np.float32], NDArray[np.bool_], slice, slice]:
+    def inside(self, center: NDArray[np.float64], side: float,
+               ) -> tuple[NDArray[np.float32], NDArray[np.bool_], slice, slice]:
         """Depth in the window of a cube, which of it lies within the cube, and the window."""
         rows, cols = self.window(center, side)
         z = self.z[rows, cols]
         return z, (z > 0) & (np.abs(z - center[2]) <= side / 2), rows, cols
 
-    def centroid(self, z: NDArray[np.float32], mask: NDArray[np.bool_], rows: slice, cols: slice) -> NDArray[np.float64]:
+    def centroid(self, z: NDArray[np.float32], mask: NDArray[np.bool_], rows: slice, cols: slice,
+                 ) -> NDArray[np.float64]:
         """Centre of mass of the masked pixels: mean position in the image and mean depth, as a point in metres."""
         count = mask.sum()
         depth = z[mask].mean(dtype=np.float64)
@@ -65,7 +67,8 @@ def detect(depth: NDArray[np.float32], intrinsics: Intrinsics, *, side: float = 
 
     Starting at the camera, everything nearer than a growing distance is looked at. The first connected piece of at
     least MIN_AREA_M2 starts a cube, which moves to the centre of mass of what it holds (5 iterations, as the original
-    code does). A cube that holds too little, or that something goes right through, as a wall or a table does, is no hand.
+    code does). A cube that holds too little, or that something goes right through, as a wall or a table does, is no
+    hand.
 
     Args:
         depth: (H, W) float32 metres, 0 = no reading.
@@ -79,7 +82,8 @@ def detect(depth: NDArray[np.float32], intrinsics: Intrinsics, *, side: float = 
     if present.size == 0:
         return found
     for limit in np.arange(present.min() + _SLAB_M, present.max() + _SLAB_M, _SLAB_M):
-        count, labels, stats, _ = cv2.connectedComponentsWithStats((unseen & (z < limit)).view(np.uint8), connectivity=4)
+        nearer = (unseen & (z < limit)).view(np.uint8)
+        count, labels, stats, _ = cv2.connectedComponentsWithStats(nearer, connectivity=4)
         for label in range(1, count):
             # Nearly all pieces are specks: their number of pixels at the limit bounds their area from above.
             if stats[label, cv2.CC_STAT_AREA] * scene.pixel_area * limit ** 2 < MIN_AREA_M2:

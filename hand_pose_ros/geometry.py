@@ -66,7 +66,7 @@ class Intrinsics:
         """Raise InputError unless the intrinsics belong to an image of this size."""
         if (width, height) != (self.width, self.height):
             raise InputError(
-                f'the depth image has {width}x{height} pixels but its camera_info describes {self.width}x{self.height}: '
+                f'the depth image has {width}x{height} pixels but its camera_info is for {self.width}x{self.height}: '
                 'use the camera_info that is published beside this very image')
 
     def project(self, points: ArrayLike) -> NDArray[np.float64]:
@@ -78,12 +78,13 @@ class Intrinsics:
     def back_project(self, pixels: ArrayLike, z: ArrayLike) -> NDArray[np.float64]:
         """Pixels (..., 2) and their depth (...) in metres -> points (..., 3) in metres."""
         pixels, z = np.asarray(pixels, np.float64), np.asarray(z, np.float64)
-        return np.stack([(pixels[..., 0] - self.cx) / self.fx * z, (pixels[..., 1] - self.cy) / self.fy * z, z], axis=-1)
+        x, y = (pixels[..., 0] - self.cx) / self.fx, (pixels[..., 1] - self.cy) / self.fy
+        return np.stack([x * z, y * z, z], axis=-1)
 
 
 @dataclass(frozen=True)
 class Cube:
-    """The metric cube in which a hand is looked for: `center` (x, y, z) in metres and the length of a `side` in metres.
+    """The metric cube in which a hand is looked for: `center` (x, y, z) and length of a `side`, in metres.
 
     *Cube units* of a point are its position in the patch and its depth: column and row of the patch in [-1, 1], and
     depth from the front face (-1) to the back face (+1). They follow the rays of the camera, as the patch does, so that

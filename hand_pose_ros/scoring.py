@@ -46,7 +46,8 @@ def explain(patch: NDArray[np.float32], joints: NDArray[np.floating], side: floa
     behind = np.where(beside > 0, 0, joints[:, 2] - surface[row, column]) * half
     miss = np.hypot(beside + outside, np.maximum(-behind, 0)) / JOINT_TOLERANCE_M
     confidence = np.exp(-0.5 * miss ** 2) * np.where(behind > FLESH_M, HIDDEN_CONFIDENCE, 1)
-    return confidence.astype(np.float32), float(confidence.mean() * _explained(surface[::2, ::2], joints, half, skeleton))
+    score = confidence.mean() * _explained(surface[::2, ::2], joints, half, skeleton)
+    return confidence.astype(np.float32), float(score)
 
 
 def _explained(surface: NDArray[np.float32], joints: NDArray[np.floating], half: float, skeleton: Skeleton) -> float:

@@ -53,7 +53,8 @@ SKELETONS = {skeleton.name: skeleton for skeleton in (
     _hand('icvl16', 'palm ' + ' '.join(f'{f}_{j}' for f in FINGERS for j in ('root', 'mid', 'tip')),
           (-1, 0, 1, 2, 0, 4, 5, 0, 7, 8, 0, 10, 11, 0, 13, 14)),
     # MSRA15 (Sun et al. 2015): wrist, then index to little finger, the thumb last.
-    _hand('msra21', 'wrist ' + ' '.join(f'{f}_{j}' for f in (*FINGERS[1:], FINGERS[0]) for j in ('mcp', 'pip', 'dip', 'tip')),
+    _hand('msra21', 'wrist '
+          + ' '.join(f'{f}_{j}' for f in (*FINGERS[1:], FINGERS[0]) for j in ('mcp', 'pip', 'dip', 'tip')),
           (-1, 0, 1, 2, 3, 0, 5, 6, 7, 0, 9, 10, 11, 0, 13, 14, 15, 0, 17, 18, 19)),
 )}
 

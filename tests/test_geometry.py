@@ -14,7 +14,8 @@ VGA = Intrinsics(588.03, 587.07, 320.0, 240.0, 640, 480)
 
 
 def camera_info(**changes):
-    info = SimpleNamespace(width=640, height=480, k=[500.0, 0, 320, 0, 510, 240, 0, 0, 1], p=[0.0] * 12, binning_x=0, binning_y=0,
+    info = SimpleNamespace(width=640, height=480, k=[500.0, 0, 320, 0, 510, 240, 0, 0, 1], p=[0.0] * 12,
+                           binning_x=0, binning_y=0,
                            roi=SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0))
     for name, value in changes.items():
         setattr(info, name, value)
@@ -114,11 +115,12 @@ def test_unusable_camera_info_is_refused(changes):
 
 
 def test_intrinsics_of_another_image_are_refused():
-    with pytest.raises(InputError, match='320x240.*640x480'):
+    with pytest.raises(InputError, match=r'320x240.*640x480'):
         VGA.check_size(320, 240)
 
 
-@pytest.mark.parametrize(('center', 'side'), [((0, 0, 0), 0.3), ((0, 0, -1), 0.3), ((0, 0, 1), 0), ((np.nan, 0, 1), 0.3)])
+@pytest.mark.parametrize(('center', 'side'), [
+    ((0, 0, 0), 0.3), ((0, 0, -1), 0.3), ((0, 0, 1), 0), ((np.nan, 0, 1), 0.3)])
 def test_a_cube_behind_the_camera_is_refused(center, side):
     with pytest.raises(InputError, match='cube'):
         Cube(center, side)

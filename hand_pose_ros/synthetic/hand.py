@@ -1,0 +1,71 @@
+"""A right hand with a forearm: shape and pose in, skin and joints out."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from hand_pose_ros.synthetic import surface
+from hand_pose_ros.synthetic.kinematics import INDEX, POSE, bone_sizes, forward
+from hand_pose_ros.synthetic.shapes import Shape, mean_shape
+
+
+def rest_pose() -> Tensor:
+    """(P,) radians: the pose in which the surface is modelled, fingers apart and straight, thumb half-way out."""
+    pose = torch.zeros(len(POSE))
+    for name, degrees in (('index_mcp_abduction', 13), ('ring_mcp_abduction', 12), ('pinky_mcp_abduction', 22),
+                          ('thumb_cmc_radial', 42), ('thumb_cmc_palmar', 28), ('thumb_cmc_roll', 70)):
+        pose[INDEX[name]] = np.deg2rad(degrees)
+    return pose
+
+
+@lru_cache(maxsize=1)
+def _template() -> tuple[Tensor, ...]:
+    shape = mean_shape()
+    rotations, origins, _ = forward(shape, rest_pose()[None], rest_pose())
+    number = lambda t: t[0].double().numpy()  # noqa: E731
+    rest = surface.RestHand(number(rotations), number(origins), number(shape.segments), number(shape.radii),
+                            float(shape.hand_breadth), float(shape.hand_length), float(shape.palm_depth),
+                            number(shape.wrist), number(shape.forearm))
+    vertices, faces, weights, part = surface.build(rest)
+    return (torch.from_numpy(vertices).float(), torch.from_numpy(faces), torch.from_numpy(weights).float(),
+            torch.from_numpy(part), rotations[0], origins[0], bone_sizes(shape)[0])
+
+
+class HandModel(nn.Module):
+    """Skin and joints of right hands (linear blend skinning over bones and half-turning joints).
+
+    Hand frame: see `hand_pose_ros.synthetic.kinematics`. The skin is one closed mesh, its triangles counter-clockwise
+    seen from outside; it includes the forearm, which turns about the wrist while the hand stays.
+
+    Attributes:
+        faces: (F, 3) int64 vertices of each triangle.
+        vertex_part: (V,) int64, 0-4 thumb to little finger, 5 palm, 6 forearm.
+    """
+
+    faces: Tensor
+    vertex_part: Tensor
+    rest: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        vertices, faces, weights, part, rotations, origins, sizes = _template()
+        self.register_buffer('faces', faces.clone())
+        self.register_buffer('vertex_part', part.clone())
+        self.register_buffer('rest', rest_pose())
+        self.register_buffer('_to_bone', rotations.mT / sizes[..., None])  # rest position -> bone, in bone sizes
+        self.register_buffer('_origins', origins.clone())
+        ones = torch.cat([vertices, torch.ones(len(vertices), 1)], 1)
+        # (V, 4K): weight times homogeneous position, so that skinning is one matrix product.
+        self.register_buffer('_basis', (weights[:, :, None] * ones[:, None]).reshape(len(vertices), -1))
+
+    def forward(self, shape: Shape, pose: Tensor) -> tuple[Tensor, Tensor]:
+        """Shape of B hands and pose (B, P) in radians -> skin (B, V, 3) and joints hand21 (B, 21, 3), in metres."""
+        rotations, origins, joints = forward(shape, pose, self.rest)
+        linear = (rotations * bone_sizes(shape)[:, :, None]) @ self._to_bone  # (B, K, 3, 3)
+        shift = origins - (linear @ self._origins[..., None])[..., 0]
+        transforms = torch.cat([linear, shift[..., None]], -1).transpose(2, 3).reshape(len(pose), -1, 3)  # (B, 4K, 3)
+        return torch.matmul(self._basis, transforms), joints

@@ -1,0 +1,132 @@
+"""The bones of the hand: names of the angles, and where they carry each bone.
+
+Hand frame: metres, right hand, origin in the wrist, +y along the metacarpal of the middle finger towards the fingers,
++x towards the thumb, +z = x cross y. For a right hand +z comes out of the *palm* (flexion moves the fingers towards
++z): seen from the palm with the fingers up, the thumb is on the right.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from hand_pose_ros.skeleton import FINGERS
+from hand_pose_ros.synthetic.shapes import Shape
+
+POSE = (
+    'wrist_flexion', 'wrist_deviation', 'ring_cmc_flexion', 'pinky_cmc_flexion',
+    'thumb_cmc_radial', 'thumb_cmc_palmar', 'thumb_cmc_roll', 'thumb_mcp_flexion', 'thumb_mcp_abduction', 'thumb_ip_flexion',
+    *(f'{finger}_{angle}' for finger in FINGERS[1:]
+      for angle in ('mcp_flexion', 'mcp_abduction', 'pip_flexion', 'dip_flexion')))
+"""Names of the P = 26 angles of a pose (B, P), in radians.
+
+Flexion is positive towards the palm. Deviation of the wrist is positive towards the thumb. Abduction of a finger is
+positive away from the middle finger (of the middle finger: towards the thumb; of the thumb: away from the index
+finger). The metacarpal of the thumb leaves the direction of the fingers by `radial` within the plane of the palm and
+by `palmar` out of it; `roll` turns its pad from facing as the palm does (0) to facing the little finger (pi/2).
+"""
+
+INDEX = {name: i for i, name in enumerate(POSE)}
+
+BONES = ('forearm', 'wrist', 'carpus', *(f'{f}_metacarpal' for f in FINGERS[1:]),
+         *(f'{f}_{b}' for f in FINGERS for b in ('joint1', 'bone1', 'joint2', 'bone2', 'joint3', 'bone3')))
+"""Names of the K = 37 frames that carry the surface. A 'joint' (and the wrist) turns half-way between its neighbours."""
+
+_RADIAL = (-1.0, -1.0, 1.0, 1.0)  # sign of the rotation about +z that abducts index, middle, ring and little finger
+_CMC_X, _CMC_Y = (0.50, 1.0, 0.63, 0.56), (0.165, 0.165, 0.175, 0.19)  # CMC over MCP, in x and y
+_SPLAY = (-1.5, 0.0, 2.5, 6.0)   # degrees about +z: directions of the fingers at abduction 0 ...
+_LEAN = (-7.0, 0.0, 6.0, 12.0)   # ... and about +y, positive leaning towards the thumb: the fingers of a fist converge
+
+
+def _axis_rotation(axis: int, angle: Tensor) -> Tensor:
+    """Rotations (..., 3, 3) by angle (...) about coordinate axis 0, 1 or 2."""
+    c, s, zero, one = torch.cos(angle), torch.sin(angle), torch.zeros_like(angle), torch.ones_like(angle)
+    rows = {0: (one, zero, zero, zero, c, -s, zero, s, c),
+            1: (c, zero, s, zero, one, zero, -s, zero, c),
+            2: (c, -s, zero, s, c, zero, zero, zero, one)}[axis]
+    return torch.stack(rows, -1).reshape(*angle.shape, 3, 3)
+
+
+def _joint_rotations(pose: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Pose (B, P) -> wrist (B,3,3), ring and little CMC in (B,4,3,3), first, second, third joint of the digits (B,5,3,3)."""
+    angle = {name: pose[:, i] for name, i in INDEX.items()}
+    wrist = _axis_rotation(0, -angle['wrist_flexion']) @ _axis_rotation(2, angle['wrist_deviation'])
+    still = torch.zeros_like(pose[:, 0])
+    cmc = _axis_rotation(0, torch.stack([still, still, angle['ring_cmc_flexion'], angle['pinky_cmc_flexion']], -1))
+
+    fingers = pose[:, 10:].reshape(-1, 4, 4)
+    abduct = fingers[..., 1] * fingers.new_tensor(_RADIAL)
+    finger1 = _axis_rotation(0, fingers[..., 0]) @ _axis_rotation(2, abduct)
+    thumb1 = (_axis_rotation(2, -angle['thumb_cmc_radial']) @ _axis_rotation(0, angle['thumb_cmc_palmar'])
+              @ _axis_rotation(1, -angle['thumb_cmc_roll']))
+    thumb2 = _axis_rotation(0, angle['thumb_mcp_flexion']) @ _axis_rotation(2, -angle['thumb_mcp_abduction'])
+    thumb3 = _axis_rotation(0, angle['thumb_ip_flexion'])
+    digits = [torch.cat([thumb[:, None], finger], 1) for thumb, finger in (
+        (thumb1, finger1), (thumb2, _axis_rotation(0, fingers[..., 2])), (thumb3, _axis_rotation(0, fingers[..., 3])))]
+    return wrist, cmc, *digits
+
+
+def metacarpal_bases(shape: Shape) -> Tensor:
+    """(B, 4, 3) carpometacarpal joints of the index to little finger."""
+    roots = shape.roots[:, 1:]
+    x, y = roots.new_tensor(_CMC_X), roots.new_tensor(_CMC_Y)
+    return torch.stack([roots[..., 0] * x, roots[..., 1] * y, roots[..., 2] * 0.3], -1)
+
+
+def forward(shape: Shape, pose: Tensor, rest: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Where the bones are.
+
+    Args:
+        shape: B hands (or one for all).
+        pose: (B, P) radians.
+        rest: (P,) the pose from which the 'joint' frames turn half-way.
+
+    Returns:
+        Rotations (B, K, 3, 3) from the frame of each bone (y along the bone, z palmar) to the hand frame; origins
+        (B, K, 3) in metres; joints (B, 21, 3) in the order of hand21, in metres.
+    """
+    batch = len(pose)
+    wrist, cmc, *turns = _joint_rotations(pose)
+    half_wrist, _, *half_turns = _joint_rotations((pose + rest) / 2)
+    degrees = torch.pi / 180
+    base = _axis_rotation(2, pose.new_tensor(_SPLAY) * degrees) @ _axis_rotation(1, pose.new_tensor(_LEAN) * degrees)
+    identity = torch.eye(3, device=pose.device).expand(batch, 1, 3, 3)
+
+    roots, bases = shape.roots.expand(batch, 5, 3), metacarpal_bases(shape).expand(batch, 4, 3)
+    along = roots[:, 1:] - bases
+    origins = torch.cat([roots[:, :1], bases + (cmc @ along[..., None])[..., 0]], 1)  # of the digits
+    parent = torch.cat([identity, cmc @ base], 1)
+    # Metacarpal frames: y from CMC to MCP, so that they can be stretched along the bone.
+    yaw, pitch = torch.atan2(-along[..., 0], along[..., 1]), torch.atan2(along[..., 2], along[..., :2].norm(dim=-1))
+    metacarpal = cmc @ _axis_rotation(2, yaw) @ _axis_rotation(0, pitch)
+
+    zero = torch.zeros(batch, 1, 3, device=pose.device)
+    rotations, places = [wrist[:, None], half_wrist[:, None], identity, metacarpal], [zero, zero, zero, bases]
+    digit_rotations, digit_places, joints = [], [], [origins]
+    segments = shape.segments.expand(batch, 5, 3)
+    for i, (turn, half) in enumerate(zip(turns, half_turns, strict=True)):
+        digit_rotations += [parent @ half, parent @ turn]
+        digit_places += [origins, origins]
+        parent = parent @ turn
+        origins = origins + parent[..., 1] * segments[..., i:i + 1]
+        joints.append(origins)
+    rotations.append(torch.stack(digit_rotations, 2).reshape(batch, 30, 3, 3))
+    places.append(torch.stack(digit_places, 2).reshape(batch, 30, 3))
+    return (torch.cat(rotations, 1), torch.cat(places, 1),
+            torch.cat([zero, torch.stack(joints, 2).reshape(batch, 20, 3)], 1))
+
+
+def bone_sizes(shape: Shape) -> Tensor:
+    """(B, K, 3) width, length and depth of each bone with its flesh, in metres: the surface is scaled by their ratios."""
+    batch = len(shape)
+    carpus = torch.stack([shape.hand_breadth / 2, shape.roots[:, 2, 1], shape.palm_depth], -1)
+    forearm = torch.stack([shape.forearm[:, 1], shape.forearm[:, 0], shape.forearm[:, 1]], -1)
+    wrist = torch.stack([shape.wrist[:, 0], (carpus[:, 1] * forearm[:, 1]).sqrt(), shape.wrist[:, 1]], -1)
+    length = (shape.roots[:, 1:] - metacarpal_bases(shape)).norm(dim=-1)
+    metacarpals = torch.stack([(shape.hand_breadth / 2)[:, None].expand(-1, 4), length,
+                               shape.palm_depth[:, None].expand(-1, 4)], -1)
+    bones = torch.stack([shape.radii, shape.segments, shape.radii], -1)  # (B, 5, 3 bones, 3 axes)
+    first = torch.cat([carpus[:, None], metacarpals], 1)[:, :, None]
+    joints = (torch.cat([first, bones[:, :, :2]], 2) * bones).sqrt()
+    digits = torch.stack([joints, bones], 3).reshape(batch, 30, 3)
+    return torch.cat([forearm[:, None], wrist[:, None], carpus[:, None], metacarpals, digits], 1)

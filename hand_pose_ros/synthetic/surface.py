@@ -1,0 +1,341 @@
+"""The skin of the average hand at rest, as one seamless mesh that knows which bones carry it.
+
+The hand is modelled the way a sculptor in clay would: tapered rolls and pads around the bones, smoothed into each other
+(a signed distance function), and the surface is then read off with a lattice (surface nets, Gibson 1998). Nothing is
+loaded: measures come from `shapes`, so the surface is as free as the numbers in it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RestHand:
+    """The average hand at rest: bone frames and measures, in metres (see `kinematics.forward`)."""
+
+    rotations: Array  # (K, 3, 3)
+    origins: Array    # (K, 3)
+    segments: Array   # (5, 3)
+    radii: Array      # (5, 3)
+    breadth: float
+    length: float
+    palm_depth: float
+    wrist: Array      # (2,)
+    forearm: Array    # (2,)
+
+    def local(self, points: Array, bone: int) -> Array:
+        """Points (N, 3) in the frame of a bone."""
+        return (points - self.origins[bone]) @ self.rotations[bone]
+
+
+def _blend(a: Array, b: Array, width: float) -> Array:
+    """Smooth union of two distances (quadratic polynomial minimum): a fillet of about `width`."""
+    h = np.clip(width - np.abs(a - b), 0, None) / width
+    return np.minimum(a, b) - h * h * width / 4
+
+
+def _roll(p: Array, a: tuple[float, float, float], b: tuple[float, float, float], ra: float, rb: float,
+          flat: float = 1.0) -> Array:
+    """A tapered roll of clay from a to b; `flat` < 1 flattens it along z."""
+    start, end = np.array(a), np.array(b)
+    along = end - start
+    offset = p - start
+    t = np.clip(offset @ along / (along @ along), 0, 1)
+    d = offset - t[:, None] * along
+    d[:, 2] /= flat
+    return (np.linalg.norm(d, axis=1) - (ra + t * (rb - ra))) * min(1.0, (1 + flat) / 2)
+
+
+def _pad(p: Array, center: tuple[float, float, float], radii: tuple[float, float, float]) -> Array:
+    """An ellipsoid (distance exact to first order at the surface)."""
+    q = (p - np.array(center)) / np.array(radii)
+    k = np.linalg.norm(q, axis=1)
+    g = np.linalg.norm(q / np.array(radii), axis=1)
+    return k * (k - 1) / np.maximum(g, 1e-9)
+
+
+def _sheet(p: Array, a: Array, b: Array, c: Array, radius: float) -> Array:
+    """A thick triangle."""
+    ab, ac = b - a, c - a
+    normal = np.cross(ab, ac)
+    normal /= np.linalg.norm(normal)
+    height = (p - a) @ normal
+    inside = np.ones(len(p), bool)
+    edge = np.full(len(p), np.inf)
+    for u, v in ((a, b), (b, c), (c, a)):
+        w, d = v - u, p - u
+        inside &= np.cross(w, d) @ normal >= 0
+        edge = np.minimum(edge, np.linalg.norm(d - np.clip(d @ w / (w @ w), 0, 1)[:, None] * w, axis=1))
+    return np.where(inside, np.abs(height), edge) - radius
+
+
+def _finger(rest: RestHand, p: Array, digit: int) -> Array:
+    """Distance to the phalanges of a digit (0 = thumb)."""
+    bones = [7 + 6 * digit + i for i in (1, 3, 5)]
+    lengths, radii = rest.segments[digit], rest.radii[digit]
+    tip = 0.92 * radii[2]
+    first = 1 if digit == 0 else 0
+    d = np.full(len(p), np.inf)
+    for i in range(first, 3):
+        q, length, r = rest.local(p, bones[i]), lengths[i], radii[i]
+        if i < 2:
+            r0, r1 = (1.06 * r, 0.98 * r) if i == first else (1.0 * r, 0.96 * r)
+            part = _roll(q, (0, 0, 0), (0, length, 0), r0, r1, 0.93)
+            belly = _pad(q, (0, 0.50 * length, 0.28 * r), (0.92 * r, 0.46 * length, 0.86 * r))
+            part = _blend(part, belly, 0.3 * r)
+        else:
+            part = _roll(q, (0, 0, 0), (0, length, 0.0), 0.97 * r, 0.80 * tip, 0.90)
+            pulp = _pad(q, (0, 0.72 * length, 0.16 * r), (1.0 * tip, length * 0.28 + tip, 0.90 * tip))
+            part = _blend(part, pulp, 0.5 * r)
+        d = _blend(d, part, 0.45 * r) if np.isfinite(d).all() else part
+    return d
+
+
+def _palm(rest: RestHand, p: Array) -> Array:
+    """Distance to the palm with its pads, hollow and finger webs, without the thumb."""
+    depth, b, length = rest.palm_depth, rest.breadth, rest.length
+    roots = [rest.origins[7 + 6 * i] for i in range(5)]
+    d = np.full(len(p), np.inf)
+    # Metacarpals, close under the skin of the back.
+    for i in range(1, 5):
+        q = rest.local(p, 2 + i)
+        reach = np.linalg.norm(roots[i] - rest.origins[2 + i])
+        size = (1.0, 1.0, 0.96, 0.88)[i - 1]
+        part = _roll(q, (0, -0.004, 0.001), (0, reach, 0.001), 0.80 * depth * size, 0.78 * depth * size)
+        flesh = _roll(q, (0, 0, 0.40 * depth), (0, reach - 0.006, 0.24 * depth), 0.72 * depth * size, 0.76 * depth * size)
+        part = _blend(part, flesh, 0.5 * depth)
+        d = _blend(d, part, 0.012) if i > 1 else part
+    # Pads at the roots of the fingers, and the webs between them.
+    for i in range(1, 5):
+        bone = 7 + 6 * i + 1
+        r = rest.radii[i, 0]
+        q = rest.local(p, bone)
+        d = _blend(d, _roll(q, (0, -0.008, 0.34 * r), (0, 0.30 * rest.segments[i, 0], 0.20 * r), 0.98 * r, 0.92 * r), 0.008)
+    for i in range(1, 4):
+        at = [rest.origins[7 + 6 * j + 1] + rest.rotations[7 + 6 * j + 1] @ np.array(
+            [0, 0.33 * rest.segments[j, 0], 0.10 * rest.radii[j, 0]]) for j in (i, i + 1)]
+        root = (roots[i] + roots[i + 1]) / 2 + np.array([0, 0.002, 0.003])
+        d = _blend(d, _sheet(p, at[0], at[1], root, 0.52 * rest.radii[i + 1, 0]), 0.009)
+    # Heel of the hand: carpus, hypothenar.
+    d = _blend(d, _pad(p, (0.005, 0.012, 0.004), (0.34 * b, 0.032, 0.88 * depth)), 0.014)
+    hypothenar = _roll(p, (-0.21 * b, 0.09 * length, 0.10 * b), (-0.345 * b, 0.29 * length, 0.105 * b), 0.155 * b, 0.125 * b)
+    return _blend(d, hypothenar, 0.014)
+
+
+def _thumb_root(rest: RestHand, p: Array) -> tuple[Array, Array]:
+    """Distances to the thenar eminence and to the web between thumb and index finger."""
+    q, length, b = rest.local(p, 8), rest.segments[0, 0], rest.breadth
+    r = rest.radii[0, 1]
+    bone = _roll(q, (0, 0, 0), (0, length, 0), 1.15 * r, 1.10 * r)
+    muscle = _roll(q, (0.002, 0.10 * length, 0.004), (0.0, 0.78 * length, 0.003), 0.185 * b, 0.13 * b)
+    ball = _roll(p, (0.10 * b, 0.10 * rest.length, 0.13 * b), tuple(rest.origins[9] * 0.72), 0.155 * b, 0.135 * b)
+    thenar = _blend(_blend(bone, muscle, 0.008), ball, 0.012)
+    index = rest.origins[13]
+    sheet = _sheet(p, rest.origins[7], rest.origins[9] + rest.rotations[8] @ np.array([0, 0.002, 0]),
+                   index + np.array([0.0, -0.006, 0.002]), 0.0065)
+    return thenar, sheet
+
+
+def _forearm(rest: RestHand, p: Array) -> Array:
+    """Distance to wrist and forearm: an oval that widens to a round, cut at the elbow."""
+    q = rest.local(p, 0)
+    t = np.clip(-q[:, 1] / rest.forearm[0], -0.2, 1)
+    grow = np.clip(t / 0.62, 0, 1)
+    grow = grow * grow * (3 - 2 * grow)
+    flare = 0.06 * np.exp(-((t - 0.02) / 0.09) ** 2)  # the heads of radius and ulna
+    rx = rest.wrist[0] * (1 + flare) + (rest.forearm[1] - rest.wrist[0]) * grow
+    rz = rest.wrist[1] * (1 + flare) + (0.86 * rest.forearm[1] - rest.wrist[1]) * grow
+    x, z = q[:, 0] / rx, (q[:, 2] - 0.002) / rz
+    k = np.sqrt(x * x + z * z)
+    side = k * (k - 1) / np.maximum(np.sqrt((x / rx) ** 2 + (z / rz) ** 2), 1e-9)
+    start, end = q[:, 1] - 0.012, -q[:, 1] - rest.forearm[0]
+    return -_blend(-_blend_max(side, end, 0.02), -start, 0.02)
+
+
+def _blend_max(a: Array, b: Array, width: float) -> Array:
+    return -_blend(-a, -b, width)
+
+
+def distance(rest: RestHand, p: Array) -> Array:
+    """Signed distance (approximate, exact in sign) of points (N, 3) to the skin, negative inside."""
+    d = _blend(_palm(rest, p), _forearm(rest, p), 0.024)
+    thenar, web = _thumb_root(rest, p)
+    d = _blend(_blend(d, thenar, 0.014), web, 0.014)
+    d = _blend(d, _finger(rest, p, 0), 0.006)
+    for digit in range(1, 5):
+        d = _blend(d, _finger(rest, p, digit), 0.005)
+    return d
+
+
+# Reading off the surface -------------------------------------------------------------------------------------------
+
+def _lattice(rest: RestHand, step: float) -> Array:
+    """Lattice points (nx, ny, nz, 3), about `step` apart in the hand, wider towards the elbow."""
+    top = rest.length + 0.02
+    ys = [top]
+    while ys[-1] > -rest.forearm[0] - 0.02:
+        ys.append(ys[-1] - step * np.interp(-ys[-1], [0.0, 0.08, 0.2], [1.0, 2.4, 3.2]))
+    y = np.array(ys[::-1])
+    x = np.arange(-0.095, 0.135, step)
+    z = np.arange(-0.034, 0.080, step)
+    grow = np.interp(-y, [0.0, 0.10, 0.25], [1.0, 1.6, 2.0])[None, :, None]
+    grid = np.stack(np.meshgrid(x, y, z, indexing='ij'), -1)
+    grid[..., 0] *= grow
+    grid[..., 2] *= grow
+    return grid
+
+
+def _surface_nets(grid: Array, value: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Zero set of `value` (nx, ny, nz) on lattice `grid` -> vertices (V, 3) and quads (Q, 4), outward."""
+    shape = tuple(n - 1 for n in value.shape)
+    total, count = np.zeros((*shape, 3)), np.zeros(shape)
+    crossings = []
+    for axis in range(3):
+        low = [slice(None)] * 3
+        high = [slice(None)] * 3
+        low[axis], high[axis] = slice(None, -1), slice(1, None)
+        a, b = value[tuple(low)], value[tuple(high)]
+        cross = (a < 0) != (b < 0)
+        t = np.where(cross, a / np.where(cross, a - b, 1), 0)[..., None]
+        point = np.where(cross[..., None], grid[tuple(low)] * (1 - t) + grid[tuple(high)] * t, 0)
+        others = [i for i in range(3) if i != axis]
+        for da in (0, 1):
+            for db in (0, 1):  # the four edges of each cell along this axis
+                part = [slice(None)] * 3
+                for other, shift in zip(others, (da, db), strict=True):
+                    part[other] = slice(shift, shift + shape[other])
+                total += point[tuple(part)]
+                count += cross[tuple(part)]
+        crossings.append((axis, cross, a < 0))
+    active = count > 0
+    index = np.full(shape, -1, np.int64)
+    index[active] = np.arange(active.sum())
+    vertices = total[active] / count[active][:, None]
+
+    quads = []
+    for axis, cross, inside in crossings:
+        u, v = (axis + 1) % 3, (axis + 2) % 3
+        at = np.argwhere(cross)
+        at = at[(at[:, u] > 0) & (at[:, v] > 0)]
+        corners = []
+        for du, dv in ((-1, -1), (0, -1), (0, 0), (-1, 0)):
+            cell = at.copy()
+            cell[:, u] += du
+            cell[:, v] += dv
+            corners.append(index[tuple(cell.T)])
+        quad = np.stack(corners, 1)
+        flip = ~inside[tuple(at.T)]
+        quad[flip] = quad[flip][:, ::-1]
+        quads.append(quad)
+    return vertices, np.concatenate(quads)
+
+
+def _gradient(rest: RestHand, p: Array, h: float = 2e-4) -> Array:
+    return np.stack([(distance(rest, p + e) - distance(rest, p - e)) / (2 * h) for e in np.eye(3) * h], -1)
+
+
+def _fair(rest: RestHand, vertices: Array, quads: NDArray[np.int64]) -> Array:
+    """Even out the vertices along the surface and put them exactly on it."""
+    ends = np.concatenate([np.stack([quads[:, i], quads[:, (i + 1) % 4]], 1) for i in range(4)])
+    for relax in (0.6, 0.6, 0.0):
+        mean = np.zeros_like(vertices)
+        np.add.at(mean, ends[:, 0], vertices[ends[:, 1]])
+        mean /= np.bincount(ends[:, 0], minlength=len(vertices))[:, None]
+        vertices = vertices + relax * (mean - vertices)
+        for _ in range(2):
+            g = _gradient(rest, vertices)
+            d = distance(rest, vertices)
+            vertices = vertices - np.clip(d / np.maximum((g * g).sum(1), 0.05), -0.003, 0.003)[:, None] * g
+    return vertices
+
+
+def _triangles(vertices: Array, quads: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Split each quad along its shorter diagonal."""
+    p = vertices[quads]
+    short = np.linalg.norm(p[:, 0] - p[:, 2], axis=1) <= np.linalg.norm(p[:, 1] - p[:, 3], axis=1)
+    split = np.where(short[:, None, None], np.array([[0, 1, 2], [0, 2, 3]]), np.array([[0, 1, 3], [1, 2, 3]]))
+    return np.take_along_axis(quads[:, None], split.reshape(-1, 1, 6), 2).reshape(-1, 3)
+
+
+# Who carries which vertex ------------------------------------------------------------------------------------------
+
+def _ramp(x: Array, low: float, high: float) -> Array:
+    t = np.clip((x - low) / (high - low), 0, 1)
+    return t * t * (3 - 2 * t)
+
+
+def _share(s: Array, reach: float, back: float | None = None) -> tuple[Array, Array, Array]:
+    """Weights of (before, at, after) a joint at distance s along the bone past it, blending over +-reach."""
+    back = reach if back is None else back
+    before, after = 1 - _ramp(s, -back, 0), _ramp(s, 0, reach)
+    return before, 1 - before - after, after
+
+
+def _weights(rest: RestHand, p: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Weights (V, K) of the bones, rows adding to 1, and the part of each vertex: 0-4 digits, 5 palm, 6 forearm."""
+    w = np.zeros((len(p), len(rest.origins)))
+    # Which digit (with its metacarpal) a vertex belongs to: sharp between fingers, gradual in the palm.
+    near = []
+    for digit in range(1, 5):
+        q = rest.local(p, 2 + digit)
+        reach = np.linalg.norm(rest.origins[7 + 6 * digit] - rest.origins[2 + digit])
+        ray = _roll(q, (0, 0, 0), (0, reach, 0), rest.radii[digit, 0], rest.radii[digit, 0])
+        near.append(np.minimum(ray, _finger(rest, p, digit)))
+    distances = np.stack(near, 1)
+    member = np.clip(1 - (distances - distances.min(1, keepdims=True)) / 0.008, 0, 1) ** 2
+    member /= member.sum(1, keepdims=True)
+    thenar, _ = _thumb_root(rest, p)
+    thumb = np.minimum(thenar, _finger(rest, p, 0))
+    d_palm = np.minimum(_palm(rest, p), distances.min(1))
+    q = rest.local(p, 8)
+    thumbness = _ramp(d_palm - thumb, -0.010, 0.014) * _ramp(q[:, 1], -0.020, 0.016)
+
+    wrist = _share(rest.local(p, 0)[:, 1], 0.020, 0.020)
+    hand = wrist[2]
+    w[:, 0], w[:, 1] = wrist[0], wrist[1]
+    for digit in range(5):
+        amount = hand * (thumbness if digit == 0 else (1 - thumbness) * member[:, digit - 1])
+        bones = [7 + 6 * digit + i for i in range(6)]
+        root = 2 if digit == 0 else 2 + digit
+        if digit:  # the carpus holds the heel of the hand
+            s = rest.local(p, root)[:, 1]
+            heel = 1 - _ramp(s, -0.002, 0.030)
+            w[:, 2] += amount * heel
+            amount = amount * (1 - heel)
+        left = amount
+        for i in range(3):
+            s = rest.local(p, bones[2 * i + 1])[:, 1]
+            r = rest.radii[digit, max(i - 1, 0)]
+            reach = (0.022, 0.026) if (digit == 0 and i == 0) else (1.0 * r, 1.0 * r)
+            before, at, after = _share(s, *reach)
+            w[:, root if i == 0 else bones[2 * i - 1]] += left * before
+            w[:, bones[2 * i]] += left * at
+            left = left * after
+        w[:, bones[5]] += left
+    part = np.full(len(p), 5)
+    for digit in range(5):
+        mine = w[:, 7 + 6 * digit + (2 if digit == 0 else 1):13 + 6 * digit].sum(1)
+        part[mine > 0.5] = digit
+    part[w[:, 0] + 0.5 * w[:, 1] > 0.5] = 6
+    return w / w.sum(1, keepdims=True), part
+
+
+def build(rest: RestHand, step: float = 0.0056) -> tuple[Array, NDArray[np.int64], Array, NDArray[np.int64]]:
+    """The skin of the hand at rest.
+
+    Returns:
+        Vertices (V, 3) in metres in the hand frame, faces (F, 3) counter-clockwise from outside, weights (V, K) of the
+        bones, and the part of each vertex (V,): 0-4 thumb to little finger, 5 palm, 6 forearm.
+    """
+    grid = _lattice(rest, step)
+    value = distance(rest, grid.reshape(-1, 3)).reshape(grid.shape[:3])
+    vertices, quads = _surface_nets(grid, value)
+    vertices = _fair(rest, vertices, quads)
+    weights, part = _weights(rest, vertices)
+    return vertices, _triangles(vertices, quads), weights, part

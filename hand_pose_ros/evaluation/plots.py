@@ -1,0 +1,146 @@
+"""Plots of results, one function each; all return a matplotlib Figure that `save` writes as PNG and SVG."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from hand_pose_ros.evaluation import metrics
+from hand_pose_ros.evaluation.results import Result, write_atomically
+
+# Okabe & Ito (2008): told apart with any colour vision, and in grey by their order of lightness.
+COLORS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9', '#000000', '#B8A800')
+
+_STYLE: dict[Any, Any] = {
+    'font.family': 'DejaVu Sans', 'font.size': 10, 'axes.titlesize': 11, 'axes.titleweight': 'bold',
+    'axes.titlelocation': 'left', 'axes.spines.top': False, 'axes.spines.right': False, 'axes.grid': True,
+    'grid.color': '#e4e7eb', 'grid.linewidth': 0.8, 'axes.axisbelow': True, 'axes.edgecolor': '#8a94a0',
+    'xtick.color': '#4a5560', 'ytick.color': '#4a5560', 'axes.labelcolor': '#2a3138', 'legend.frameon': False,
+    'svg.hashsalt': 'hand_pose_ros',  # the same figure gives the same file
+}
+
+
+def curves(results: Sequence[Result]) -> Figure:
+    """Fraction of frames whose every joint, and of joints that themselves, are within a distance."""
+    distances = np.linspace(0, 80, 321)
+    figure, (left, right) = _figure(10.5, 4.3, 2)
+    for result, color in _colored(results):
+        errors, wide = result.errors_mm, 2.4 if result is results[0] else 1.6
+        left.plot(distances, 100 * metrics.success_curve(errors, distances), color=color, lw=wide,
+                  label=f'{result.name}   AUC {metrics.auc(errors):.3f}')
+        right.plot(distances, 100 * metrics.pck(errors, distances), color=color, lw=wide,
+                   label=f'{result.name}   mean {metrics.mean_mm(errors):.1f} mm')
+    left.set(title='Frames with all joints within', ylabel='frames, %')
+    right.set(title='Joints within', ylabel='joints, %')
+    for axes in (left, right):
+        axes.set(xlim=(0, 80), ylim=(0, 100), xlabel='distance, mm')
+        axes.legend(loc='lower right', fontsize=9)
+    return figure
+
+
+def joint_bars(results: Sequence[Result]) -> Figure:
+    """Mean error of each joint, results side by side; they must have the same skeleton."""
+    skeleton = results[0].skeleton
+    figure, (axes,) = _figure(max(7.0, 0.5 * len(skeleton) + 2), 4)
+    width = 0.8 / len(results)
+    for k, (result, color) in enumerate(_colored(results)):
+        means = metrics.per_joint_mm(result.errors_mm)
+        axes.bar(np.arange(len(skeleton)) + (k + 0.5) * width - 0.4, means, width * 0.92, color=color,
+                 label=result.name)
+    axes.set_xticks(range(len(skeleton)), [name.replace('_', ' ') for name in skeleton.joint_names],
+                    rotation=45, ha='right', rotation_mode='anchor')
+    axes.set(title='Error of each joint', ylabel='mean error, mm', xlim=(-0.6, len(skeleton) - 0.4))
+    axes.grid(axis='x', visible=False)
+    if len(results) > 1:
+        axes.legend(fontsize=9, ncols=min(4, len(results)), loc='lower left', bbox_to_anchor=(0, 1.06))
+    return figure
+
+
+def over_time(result: Result) -> Figure:
+    """Mean and worst error of each frame, missed frames as marks at the foot; parts are separated."""
+    errors = result.errors_mm
+    means, worst = metrics.frame_means_mm(errors), metrics.worst_joints_mm(errors)
+    figure, (axes,) = _figure(10.5, 3.4)
+    at, label = _time_axis(result)
+    _band(axes, at, worst, '#56B4E9', 'worst joint')
+    _band(axes, at, means, COLORS[0], 'mean of joints')
+    missed = metrics.missed_frames(errors)
+    top = np.nanpercentile(worst[np.isfinite(worst)], 99.8) * 1.05 if np.isfinite(worst).any() else 1
+    if missed.any():
+        axes.plot(at[missed], np.full(missed.sum(), 0.01 * top), '|', color='#D55E00', ms=9, clip_on=False,
+                  label='missed')
+    for name, (start, _) in result.parts.items():
+        axes.axvline(at[start], color='#4a5560', lw=1, ls=':')
+        axes.annotate(name, (at[start], 1), xycoords=('data', 'axes fraction'), xytext=(4, -2), fontsize=9,
+                      textcoords='offset points', va='top', color='#4a5560')
+    axes.set(title='Error over time', xlabel=label, ylabel='error, mm', ylim=(0, top),
+             xlim=(at[0], at[-1]) if len(at) > 1 else None)
+    axes.legend(fontsize=9, ncols=3, loc='lower right', bbox_to_anchor=(1, 1))
+    return figure
+
+
+def latency(result: Result) -> Figure:
+    """Milliseconds of each stage in each frame, stacked: what a frame costs, and where."""
+    at, label = _time_axis(result)
+    stages = {stage: 1000 * np.nan_to_num(seconds) for stage, seconds in result.seconds.items() if stage != 'total'}
+    figure, (axes,) = _figure(10.5, 3.2)
+    axes.stackplot(at, *stages.values(), labels=list(stages), colors=COLORS, lw=0, step='mid')
+    total = np.sum(list(stages.values()), axis=0)
+    axes.set(title='Time of each frame', xlabel=label, ylabel='ms', ylim=(0, np.percentile(total, 99.5) * 1.1),
+             xlim=(at[0], at[-1]) if len(at) > 1 else None)
+    axes.legend(fontsize=9, ncols=len(stages), loc='lower right', bbox_to_anchor=(1, 1))
+    return figure
+
+
+def to_bytes(figure: Figure, form: str) -> bytes:
+    """The figure as the content of a 'png' or 'svg' file."""
+    buffer = BytesIO()
+    with matplotlib.rc_context(_STYLE):
+        figure.savefig(buffer, format=form, dpi=150, metadata={'Date': None} if form == 'svg' else None)
+    return buffer.getvalue()
+
+
+def save(figure: Figure, path: str | Path) -> None:
+    """Write `path`.png and `path`.svg."""
+    for form in ('png', 'svg'):
+        data = to_bytes(figure, form)
+        write_atomically(Path(f'{path}.{form}'), lambda file, data=data: file.write(data))  # type: ignore[misc]
+
+
+def _figure(width: float, height: float, columns: int = 1) -> tuple[Figure, NDArray[np.object_]]:
+    """A figure and its row of axes. Without pyplot, so that no display is asked for and nothing is left behind."""
+    with matplotlib.rc_context(_STYLE):
+        figure = Figure((width, height), layout='constrained')
+        return figure, figure.subplots(1, columns, squeeze=False)[0]
+
+
+def _colored(results: Sequence[Result]) -> list[tuple[Result, str]]:
+    return [(result, COLORS[k % len(COLORS)]) for k, result in enumerate(results)]
+
+
+def _time_axis(result: Result) -> tuple[NDArray[np.float64], str]:
+    if result.stamps_ns is None:
+        return np.arange(1.0, len(result.predictions) + 1), 'frame'
+    return (result.stamps_ns - result.stamps_ns[0]) / 1e9, 'time, s'
+
+
+def _band(axes: Axes, at: NDArray[np.float64], values: NDArray[np.float64], color: str, label: str) -> None:
+    """A line; of more frames than the picture has columns, the range of every few frames with their median."""
+    values = np.where(np.isfinite(values), values, np.nan)
+    group = -(-len(values) // 800)
+    if group == 1:
+        axes.plot(at, values, color=color, lw=1.2, label=label)
+        return
+    cut = len(values) // group * group
+    grouped = np.ma.masked_invalid(values[:cut].reshape(-1, group))
+    middle = at[:cut].reshape(-1, group).mean(1)
+    axes.fill_between(middle, grouped.min(1), grouped.max(1), color=color, alpha=0.25, lw=0)
+    axes.plot(middle, np.ma.median(grouped, axis=1), color=color, lw=1, label=f'{label} (median, range of {group})')

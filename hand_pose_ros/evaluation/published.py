@@ -1,0 +1,201 @@
+"""Published results: the text format of the field, and the three datasets it is used for.
+
+One frame a line, `u v d` for each joint: pixels and millimetres, separated by blanks, optionally behind a file
+name, optionally gzipped. Joints become metres in the optical frame (y down), also for NYU and MSRA whose own frames
+have y up: errors are distances and do not depend on it.
+"""
+
+from __future__ import annotations
+
+import gzip
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hand_pose_ros.errors import InputError
+from hand_pose_ros.evaluation.results import Result
+from hand_pose_ros.geometry import Intrinsics
+from hand_pose_ros.skeleton import Skeleton, get_skeleton
+
+Rows = slice | NDArray[np.intp]
+Match = tuple[Rows, Rows, tuple[str, ...]]
+"""Which rows of the predictions and of the truth belong together, and what must be said about it."""
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A test set.
+
+    Attributes:
+        intrinsics: of its depth images, in pixels.
+        parts: its sequences or subjects, name -> (first row, row after the last); empty if it has none.
+        published: (method, mean error in mm) as printed in the table of V2V-PoseNet (Moon et al. 2018).
+    """
+
+    name: str
+    intrinsics: Intrinsics
+    skeleton: Skeleton
+    parts: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    published: tuple[tuple[str, float], ...] = ()
+
+    @property
+    def frames(self) -> int:
+        """Number of test frames, 0 if it is not fixed."""
+        return max((stop for _, stop in self.parts.values()), default=0)
+
+
+DATASETS = {dataset.name: dataset for dataset in (
+    # The two test subjects of NYU (Tompson et al. 2014): the bone lengths of the labels change between the rows.
+    Dataset('nyu', Intrinsics(588.03, 587.07, 320, 240, 640, 480), get_skeleton('nyu14'),
+            {'subject 1': (0, 2440), 'subject 2': (2440, 8252)},
+            (('DeepPrior with refinement', 19.73), ('DeepModel', 17.04), ('DeepPrior++', 12.24))),
+    # DeepPrior's own code has 241.42 for both focal lengths of ICVL, which lowers means by about 0.013 mm.
+    Dataset('icvl', Intrinsics(240.99, 240.96, 160, 120, 320, 240), get_skeleton('icvl16'),
+            {'sequence 1': (0, 702), 'sequence 2': (702, 1596)},
+            (('LRF', 12.58), ('DeepPrior', 10.4), ('DeepPrior++', 8.1))),
+    Dataset('msra', Intrinsics(241.42, 241.42, 160, 120, 320, 240), get_skeleton('msra21'),
+            published=(('DeepPrior++', 9.5),)),
+)}
+
+
+@dataclass(frozen=True)
+class Labels:
+    """What a text file holds: `uvd` (N, J, 3), pixels and millimetres, and the file `names`, if any."""
+
+    path: Path
+    uvd: NDArray[np.float64]
+    names: tuple[str, ...] = ()
+
+    def points(self, intrinsics: Intrinsics) -> NDArray[np.float64]:
+        """Joints (N, J, 3) in metres, optical frame; NaN where missing.
+
+        A joint is missing if one of its numbers is not finite, or if its depth is 0 or less: result files write
+        0 0 0 for a joint that was not found.
+        """
+        uvd = self.uvd.copy()
+        uvd[~np.isfinite(uvd).all(-1) | (uvd[..., 2] <= 0)] = np.nan
+        return intrinsics.back_project(uvd[..., :2], uvd[..., 2] / 1000)
+
+
+def read_text(path: str | Path, skeleton: Skeleton) -> Labels:
+    """Read a file of predictions or labels; blank lines are skipped.
+
+    Raises:
+        InputError: the file cannot be read or is empty, a line has not 3 numbers for every joint of the skeleton,
+            or the depths are not millimetres.
+    """
+    path = Path(path)
+    rows, names = [], []
+    for number, line in enumerate(_text(path).splitlines(), 1):
+        fields = line.split()
+        if not fields:
+            continue
+        if not _is_number(fields[0]):
+            names.append(fields.pop(0))
+        if len(fields) != 3 * len(skeleton):
+            raise InputError(
+                f'{path}: line {number} has {len(fields)} numbers, but the {len(skeleton)} joints of '
+                f'{skeleton.name} have u v d each, {3 * len(skeleton)} together: choose another --dataset, '
+                'or mend the line')
+        try:
+            rows.append(np.array(fields, np.float64))
+        except ValueError:
+            wrong = next(text for text in fields if not _is_number(text))
+            raise InputError(f"{path}: line {number} has '{wrong}' where a number belongs "
+                             '(write nan for a missing joint)') from None
+    if not rows:
+        raise InputError(f'{path}: there is no line with joints in it')
+    if names and len(names) != len(rows):
+        raise InputError(f'{path}: {len(names)} of {len(rows)} lines begin with a file name: '
+                         'give all of them one, or none')
+    uvd = np.stack(rows).reshape(len(rows), len(skeleton), 3)
+    depth = uvd[..., 2][uvd[..., 2] > 0]
+    if depth.size and np.median(depth) < 20:
+        raise InputError(f'{path}: the median depth is {np.median(depth):.3g}, which looks like metres: '
+                         'the third number of a joint is its depth in millimetres')
+    return Labels(path, uvd, tuple(names))
+
+
+def load_published(predictions: str | Path, truth: str | Path, dataset: Dataset,
+                   intrinsics: Intrinsics | None = None) -> Result:
+    """Predictions and labels of a dataset, matched row by row.
+
+    Files with names on both sides are matched by name. Otherwise both must have the same number of rows, or one
+    of them that of a single part of the dataset: it is then matched to this part, and the result has a note of it.
+
+    Args:
+        intrinsics: instead of those of the dataset.
+
+    Raises:
+        InputError: a file is not as `read_text` wants it, or the rows cannot be matched.
+    """
+    camera = intrinsics or dataset.intrinsics
+    guess, label = read_text(predictions, dataset.skeleton), read_text(truth, dataset.skeleton)
+    if guess.names and label.names:
+        rows_p, rows_t, notes = _match_names(guess, label)
+    else:
+        rows_p, rows_t, notes = _match_counts(guess, label, dataset)
+    whole = len(guess.uvd) == len(label.uvd) == dataset.frames
+    return Result(
+        name=Path(predictions).name.removesuffix('.gz').removesuffix('.txt'),
+        skeleton=dataset.skeleton, intrinsics=camera,
+        predictions=guess.points(camera)[rows_p], truth=label.points(camera)[rows_t],
+        parts=dict(dataset.parts) if whole else {}, notes=notes,
+        info={'predictions': str(predictions), 'ground_truth': str(truth), 'dataset': dataset.name,
+              'intrinsics': f'fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g}'})
+
+
+def _match_counts(guess: Labels, label: Labels, dataset: Dataset) -> Match:
+    everything = slice(None)
+    p, t = len(guess.uvd), len(label.uvd)
+    if p == t:
+        return everything, everything, ()
+    for part, (start, stop) in dataset.parts.items():
+        if {p, t} == {stop - start, dataset.frames}:
+            short, long = (guess, label) if p < t else (label, guess)
+            note = (f'{short.path.name} has {min(p, t)} frames, as many as {part} of {dataset.name}: it is matched '
+                    f'to rows {start + 1}-{stop} of {long.path.name}; the other {abs(p - t)} are not scored.')
+            rows = slice(start, stop)
+            return (everything, rows, (note,)) if p < t else (rows, everything, (note,))
+    parts = ', '.join(f'{stop - start} ({part})' for part, (start, stop) in dataset.parts.items())
+    raise InputError(f'{guess.path} has {p} frames but {label.path} has {t}: which row belongs to which is unknown; '
+                     'give files of the same length' + (f', or one of {parts} of {dataset.name}' if parts else ''))
+
+
+def _match_names(guess: Labels, label: Labels) -> Match:
+    for labels in (guess, label):
+        if len(set(labels.names)) < len(labels.names):
+            twice = next(name for name in labels.names if labels.names.count(name) > 1)
+            raise InputError(f"{labels.path}: the file name '{twice}' stands on two lines: keep one of them")
+    row = {name: k for k, name in enumerate(label.names)}
+    unknown = next((name for name in guess.names if name not in row), None)
+    if unknown is not None:
+        raise InputError(f"{guess.path}: '{unknown}' is not in {label.path}: both must name frames alike")
+    left = len(label.names) - len(guess.names)
+    note = (f'{guess.path.name} names {len(guess.names)} of the {len(label.names)} frames of {label.path.name}; '
+            f'the other {left} are not scored.')
+    return (np.arange(len(guess.names)), np.array([row[name] for name in guess.names]),
+            (note,) if left else ())
+
+
+def _text(path: Path) -> str:
+    try:
+        data = path.read_bytes()
+        if data[:2] == b'\x1f\x8b':
+            data = gzip.decompress(data)
+        return data.decode()
+    except OSError as error:
+        raise InputError(f'{path}: the file cannot be read ({error.strerror or error})') from None
+    except (EOFError, UnicodeDecodeError):
+        raise InputError(f'{path}: this is not text, or a gzip file that was cut short') from None
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,142 @@
+"""What an evaluation gives: joints, truth, times and their origin, kept together and saved as one file."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import IO, Any
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hand_pose_ros import __version__
+from hand_pose_ros.errors import InputError
+from hand_pose_ros.evaluation import metrics
+from hand_pose_ros.geometry import Intrinsics
+from hand_pose_ros.skeleton import Skeleton
+
+FORMAT = 1
+"""Raised when files of the old form can no longer be read."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """The joints of N frames.
+
+    Attributes:
+        name: what tables and legends call it.
+        intrinsics: of the depth images.
+        predictions: (N, J, 3) metres, optical frame; NaN = not predicted.
+        truth: the same, NaN = not labelled; None if there is none at all.
+        stamps_ns: (N,) of the depth images, or None.
+        seconds: stage -> (N,) time it took; NaN = did not run.
+        parts: name -> (first row, row after the last) of the subjects or sequences that are reported apart.
+        notes: whatever a reader of the numbers must know.
+        info: where it comes from: files, model, device, command.
+    """
+
+    name: str
+    skeleton: Skeleton
+    intrinsics: Intrinsics
+    predictions: NDArray[np.float64]
+    truth: NDArray[np.float64] | None = None
+    stamps_ns: NDArray[np.int64] | None = None
+    seconds: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    parts: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    info: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def errors_mm(self) -> NDArray[np.float64]:
+        """(N, J), see `metrics.joint_errors_mm`; all NaN without truth."""
+        if self.truth is None:
+            return np.full(self.predictions.shape[:2], np.nan)
+        return metrics.joint_errors_mm(self.predictions, self.truth)
+
+    def summary(self) -> dict[str, Any]:
+        """Every number of the result, ready for JSON."""
+        detected = np.isfinite(self.predictions).all(-1).any(-1)
+        summary: dict[str, Any] = {'name': self.name, 'frames': len(self.predictions)}
+        if self.truth is None:
+            summary |= metrics.smoothness(self.predictions, self.skeleton)
+        else:
+            summary |= metrics.summarise(self.predictions, self.truth, self.skeleton)
+        summary |= {'frames_total': len(self.predictions),
+                    'detection_rate': float(np.mean(detected)) if self.predictions.size else None}
+        if self.parts and self.truth is not None:
+            summary['parts'] = {
+                name: metrics.summarise(self.predictions[start:stop], self.truth[start:stop], self.skeleton)
+                for name, (start, stop) in self.parts.items()}
+        if self.seconds:
+            summary['latency_ms'] = {
+                stage: metrics.percentiles(1000 * seconds) for stage, seconds in self.seconds.items()}
+        return summary | {'notes': list(self.notes), **self.info}
+
+    def save(self, path: str | Path) -> None:
+        """Write everything to an .npz file, which `load` reads and numpy.load too."""
+        meta = {'format': FORMAT, 'version': __version__, 'name': self.name, 'notes': self.notes,
+                'skeleton': asdict(self.skeleton), 'intrinsics': asdict(self.intrinsics),
+                'parts': dict(self.parts), 'info': dict(self.info), 'stages': list(self.seconds)}
+        arrays: dict[str, Any] = {'joints': self.predictions, 'meta': np.array(json.dumps(meta))}
+        optional = {'truth': self.truth, 'stamps_ns': self.stamps_ns}
+        arrays |= {key: value for key, value in optional.items() if value is not None}
+        arrays |= {f'seconds_{k}': seconds for k, seconds in enumerate(self.seconds.values())}
+        write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
+
+    @classmethod
+    def load(cls, path: str | Path) -> Result:
+        """Read what `save` wrote.
+
+        Raises:
+            InputError: the file is missing, damaged, or of another kind.
+        """
+        try:
+            with np.load(path) as file:
+                meta = json.loads(file['meta'].item())
+                if meta['format'] != FORMAT:
+                    raise InputError(f"{path}: version {meta['version']} wrote it in another form: evaluate again")
+                name, joint_names, parents = (meta['skeleton'][key] for key in ('name', 'joint_names', 'parents'))
+                return cls(
+                    name=meta['name'], skeleton=Skeleton(name, tuple(joint_names), tuple(parents)),
+                    intrinsics=Intrinsics(**meta['intrinsics']), predictions=file['joints'],
+                    truth=file.get('truth'), stamps_ns=file.get('stamps_ns'),
+                    seconds={stage: file[f'seconds_{k}'] for k, stage in enumerate(meta['stages'])},
+                    parts={name: (start, stop) for name, (start, stop) in meta['parts'].items()},
+                    notes=tuple(meta['notes']), info=meta['info'])
+        except OSError as error:
+            raise InputError(f'{path}: the file cannot be read ({error.strerror or error})') from None
+        except (BadZipFile, EOFError, KeyError, TypeError, ValueError):
+            raise InputError(f'{path}: not a result of `hand-pose evaluate --out`, or damaged') from None
+
+
+def write_json(value: Any, path: str | Path) -> None:
+    """Write strict JSON (no NaN) atomically."""
+    text = json.dumps(value, indent=2, allow_nan=False) + '\n'
+    write_atomically(path, lambda file: file.write(text.encode()))
+
+
+def write_atomically(path: str | Path, write: Callable[[IO[bytes]], Any]) -> None:
+    """Let `write` fill a temporary file and move it to `path`, so that no half-written file is ever seen.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    path = Path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f'.{path.name}.')
+    except OSError as error:
+        raise InputError(f'{path}: cannot be written ({error.strerror}): choose another place') from None
+    try:
+        with open(handle, 'wb') as file:
+            write(file)
+        os.chmod(temporary, 0o644)  # mkstemp keeps its files to their owner
+        os.replace(temporary, path)
+    except BaseException:
+        os.unlink(temporary)
+        raise

@@ -1,0 +1,109 @@
+"""3D joints from 2D ones and the depth image: how the 2D network of Tompson et al. (2014) is compared in 3D."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hand_pose_ros.errors import InputError
+from hand_pose_ros.evaluation.published import Dataset, read_text
+from hand_pose_ros.evaluation.results import Result
+from hand_pose_ros.geometry import Intrinsics
+
+Protocol = Literal['paper', 'code']
+
+PALM = 13
+"""Row of nyu14 whose labelled depth is the middle of the cube."""
+SIDES_M = {'subject 1': 0.300, 'subject 2': 0.249}
+"""Cube sides of DeepPrior: the second hand is 0.83 times as large."""
+CODE_REACH_M = 0.150
+_NO_DATA_MM = 2001
+
+
+def read_nyu_depth(path: str | Path) -> NDArray[np.float32]:
+    """Depth (H, W) in metres of an NYU frame, 0 = no reading: an 8-bit colour PNG with mm = 256 green + blue.
+
+    Raises:
+        InputError: the file cannot be read or is of another form.
+    """
+    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if picture is None or picture.dtype != np.uint8 or picture.ndim != 3 or picture[..., 2].any():
+        raise InputError(f'{path}: not a depth frame of NYU (an 8-bit colour PNG whose red is 0): '
+                         'give the folder of depth_1_0000001.png and so on')
+    millimetres = picture[..., 1].astype(np.float32) * 256 + picture[..., 0]
+    millimetres[millimetres == _NO_DATA_MM] = 0
+    return millimetres / np.float32(1000)
+
+
+def lift(pixels: NDArray[np.float64], depth: NDArray[np.float32], intrinsics: Intrinsics, palm_z: float,
+         side: float, truth_z: NDArray[np.float64], protocol: Protocol = 'paper') -> NDArray[np.float64]:
+    """Joints (J, 3) in metres from their pixels (J, 2) and the depth that is measured there.
+
+    Measured is the surface, not the joint, and beside a thin finger the background. What happens then decides the
+    comparison, and the paper and its code disagree:
+
+    - 'paper': a depth outside the cube around the palm, or no reading, becomes that of the cube's back face
+      (Oberweger et al. 2015, section 4).
+    - 'code': a depth more than 150 mm from the labelled palm becomes the *labelled* depth of the joint, which
+      knows the answer and favours the method (public code of November 2016).
+
+    Args:
+        depth: (H, W) metres, 0 = no reading.
+        palm_z: labelled depth of the palm, the middle of the cube; side: of the cube.
+        truth_z: (J,) labelled depths, which only 'code' looks at.
+    """
+    columns, rows = np.rint(np.nan_to_num(pixels, nan=-1)).astype(int).T
+    inside = (columns >= 0) & (columns < depth.shape[1]) & (rows >= 0) & (rows < depth.shape[0])
+    z = np.zeros(len(pixels))
+    z[inside] = depth[rows[inside], columns[inside]]
+    if protocol == 'paper':
+        z[np.abs(z - palm_z) > side / 2] = palm_z + side / 2
+    else:
+        lost = np.abs(z - palm_z) > CODE_REACH_M
+        z[lost] = truth_z[lost]
+    return intrinsics.back_project(pixels, z)
+
+
+def load_tompson(predictions: str | Path, truth: str | Path, folder: str | Path, dataset: Dataset,
+                 protocol: Protocol = 'paper') -> Result:
+    """The 2D joints of an .npz file (`uv`: (N, 14, 2) pixels) on NYU, lifted with the depth frames of a folder.
+
+    Frames whose depth is not in the folder are not scored, and a note says how many.
+
+    Args:
+        folder: with depth_1_%07d.png, the number of the row counted from 1.
+
+    Raises:
+        InputError: a file is of another form, the counts differ, or the folder has none of the frames.
+    """
+    try:
+        with np.load(predictions) as file:
+            pixels = file['uv'].astype(np.float64)
+    except (OSError, KeyError, ValueError):
+        raise InputError(f'{predictions}: not an .npz file with 2D joints `uv` of shape (frames, 14, 2)') from None
+    label = read_text(truth, dataset.skeleton)
+    if dataset.name != 'nyu' or pixels.shape != (dataset.frames, len(dataset.skeleton), 2) \
+            or len(label.uvd) != dataset.frames:
+        raise InputError(f'{predictions} has 2D joints of shape {pixels.shape} and {truth} {len(label.uvd)} frames: '
+                         'the protocol needs all 8252 test frames of --dataset nyu, 14 joints each')
+    camera, points = dataset.intrinsics, label.points(dataset.intrinsics)
+    lifted = np.full(points.shape, np.nan)
+    paths = {row: Path(folder) / f'depth_1_{row + 1:07d}.png' for row in range(dataset.frames)}
+    there = [row for row, path in paths.items() if path.is_file()]
+    if not there:
+        raise InputError(f'{folder}: none of depth_1_0000001.png to depth_1_{dataset.frames:07d}.png is there')
+    for row in there:
+        side = next(SIDES_M[part] for part, (start, stop) in dataset.parts.items() if start <= row < stop)
+        lifted[row] = lift(pixels[row], read_nyu_depth(paths[row]), camera, points[row, PALM, 2], side,
+                           points[row, :, 2], protocol)
+    notes = [f"2D joints lifted with the depth image, protocol '{protocol}'; the cube is centred on the labelled palm."]
+    if len(there) < dataset.frames:
+        points[np.setdiff1d(np.arange(dataset.frames), there)] = np.nan
+        notes.append(f'{len(there)} of {dataset.frames} frames have a depth image in {folder}: only they are scored.')
+    return Result(Path(predictions).stem, dataset.skeleton, camera, lifted, points, parts=dict(dataset.parts),
+                  notes=tuple(notes),
+                  info={'predictions': str(predictions), 'ground_truth': str(truth), 'dataset': dataset.name})

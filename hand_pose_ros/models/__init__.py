@@ -10,7 +10,9 @@ from typing import Any
 from torch import nn
 
 from hand_pose_ros.errors import HandPoseError
+from hand_pose_ros.models.dense import HandDense
 from hand_pose_ros.models.prior_net import CenterRefiner, Deep, MultiScale, Shallow
+from hand_pose_ros.models.refiner import ORRef, StdRef
 from hand_pose_ros.models.resnet import ResNet
 
 ARCHITECTURES: dict[str, Callable[..., nn.Module]] = {
@@ -19,14 +21,18 @@ ARCHITECTURES: dict[str, Callable[..., nn.Module]] = {
     'deep_prior': partial(Deep, bottleneck=30),
     'multi_scale': MultiScale,
     'resnet': ResNet,
+    'hand_dense': HandDense,
     'center_refiner': CenterRefiner,
+    'std_ref': StdRef,
+    'or_ref': ORRef,
 }
 
 
 def build(architecture: str, **config: Any) -> nn.Module:
     """A network with fresh weights, by name; it remembers its `architecture` and its complete `config`.
 
-    Pose networks map patches (B, 1, 128, 128) to joints (B, J, 3) in cube units.
+    Pose networks map patches (B, 1, 128, 128) to joints (B, J, 3) in cube units; std_ref and or_ref map patches and
+    joints to better joints; center_refiner maps patches to the palm (B, 3).
 
     Raises:
         HandPoseError: no such architecture, or a value in `config` that it does not take.

@@ -118,7 +118,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     with open(path, 'rb') as file:
         start = file.read(4)
     if start[:1] == b'\x80' or start == b'PK\x03\x04':  # a pickle, or a zip around one (torch.save)
-        raise CheckpointError(f'{path} is a pickle, which can run code when read: only .safetensors are accepted')
+        raise CheckpointError(f'{path} is a pickle, which can run code when read: give a .safetensors file')
     try:
         with safe_open(path, framework='pt') as file:
             header = file.metadata() or {}

@@ -101,9 +101,10 @@ class PoseHead(nn.Module):
         return output.view(-1, self.joints, 3)
 
 
-def relu_conv(inputs: int, outputs: int, size: int, stride: int = 1, padding: int = 0) -> nn.Conv2d:
+def relu_conv(inputs: int, outputs: int, size: int, stride: int = 1, padding: int = 0,
+              groups: int = 1) -> nn.Conv2d:
     """A convolution before a ReLU: N(0, sqrt(2 / fan_in)), zero bias (He et al. 2015)."""
-    layer = nn.Conv2d(inputs, outputs, size, stride, padding)
+    layer = nn.Conv2d(inputs, outputs, size, stride, padding, groups=groups)
     nn.init.kaiming_normal_(layer.weight, nonlinearity='relu')
     nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
     return layer

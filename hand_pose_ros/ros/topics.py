@@ -1,0 +1,55 @@
+"""The topics that the node listens to, and who is at the other end when nothing arrives."""
+
+from __future__ import annotations
+
+from rclpy.node import Node
+
+IMAGE, CAMERA_INFO = 'depth/image_rect', 'depth/camera_info'
+
+
+def input_topics(node: Node, transport: str) -> tuple[str, str]:
+    """Resolved names of the depth image (with its transport) and of camera_info.
+
+    A remapped image takes its camera_info along: unless that is remapped too, it is looked for beside the image, as
+    image_transport does. The compressed transports follow the name of the image as well.
+    """
+    image, info = node.resolve_topic_name(IMAGE), node.resolve_topic_name(CAMERA_INFO)
+    if info == node.resolve_topic_name(CAMERA_INFO, only_expand=True):
+        info = f'{image.rpartition("/")[0]}/camera_info'
+    return (image if transport == 'raw' else f'{image}/{transport}'), info
+
+
+def describe_publishers(node: Node, topic: str) -> str:
+    """Who publishes on a topic and how, e.g. `published by /camera (sensor_msgs/msg/Image, best effort, volatile)`."""
+    publishers = [
+        f'{info.node_namespace.rstrip("/")}/{info.node_name} ({info.topic_type}, '
+        f'{info.qos_profile.reliability.name.lower().replace("_", " ")}, '
+        f'{info.qos_profile.durability.name.lower().replace("_", " ")})'
+        for info in node.get_publishers_info_by_topic(topic)]
+    return 'published by ' + ', '.join(sorted(publishers)) if publishers else 'without any publisher'
+
+
+def explain_silence(node: Node, topic: str, topic_type: str, seconds: float) -> str:
+    """Why no image may have arrived for some seconds, and what to do.
+
+    Args:
+        topic: resolved name.
+        topic_type: what is expected there, e.g. `sensor_msgs/msg/Image`.
+    """
+    said = f'no image arrived on {topic} for {seconds:.0f} s; the topic is {describe_publishers(node, topic)}'
+    infos = node.get_publishers_info_by_topic(topic)
+    if not infos:
+        others = [name for name, types in node.get_topic_names_and_types() if topic_type in types and name != topic]
+        where = f' ({topic_type} is published on {", ".join(others)})' if others else ''
+        return f'{said}{where}: start the camera, or name its topic with --ros-args -r {IMAGE}:=/its/topic'
+    if all(info.topic_type != topic_type for info in infos):
+        return f'{said}, but {topic_type} is expected: remap {IMAGE}, or set the parameter transport'
+    return (f'{said}: if it does publish, set the Fast DDS profile for large images where it runs, or ask for what it '
+            f'offers with the parameter qos_overrides.{topic}.subscription.reliability')
+
+
+def explain_incompatible(node: Node, topic: str, policy: str) -> str:
+    """One sentence for a publisher whose quality of service does not fit the subscription."""
+    return (f'a publisher on {topic} does not offer the {policy} that was asked for, so nothing arrives from it (the '
+            f'topic is {describe_publishers(node, topic)}): set the parameter '
+            f'qos_overrides.{topic}.subscription.{policy}')

@@ -1,0 +1,537 @@
+"""What the node promises: the real node, over real DDS."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+import weakref
+from array import array
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip('rclpy', reason='needs ROS 2')
+pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
+
+from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from lifecycle_msgs.srv import ChangeState, GetState  # noqa: E402
+from rcl_interfaces.msg import Log  # noqa: E402
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from rclpy.node import Node  # noqa: E402
+from rclpy.parameter import Parameter  # noqa: E402
+from rclpy.parameter_client import AsyncParameterClient  # noqa: E402
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image  # noqa: E402
+from std_srvs.srv import SetBool, Trigger  # noqa: E402
+from visualization_msgs.msg import Marker, MarkerArray  # noqa: E402
+
+from hand_pose_ros.depth import encode_compressed  # noqa: E402
+from hand_pose_ros.models import build  # noqa: E402
+from hand_pose_ros.models.checkpoints import save_checkpoint  # noqa: E402
+from hand_pose_ros.msg import HandJointsArray, HandSkeleton  # noqa: E402
+from hand_pose_ros.ros import node as node_module  # noqa: E402
+from hand_pose_ros.ros.node import EstimatorNode  # noqa: E402
+from hand_pose_ros.skeleton import HAND21  # noqa: E402
+
+pytestmark = pytest.mark.usefixtures('ros_domain')
+
+WIDTH, HEIGHT, FOCAL = 160, 120, 140.0
+BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+@pytest.fixture(scope='module')
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A network that has learned nothing: what it says does not matter here, only that it says something."""
+    path = tmp_path_factory.mktemp('weights') / 'untrained.safetensors'
+    save_checkpoint(path, build('deep_prior', joints=21), {'skeleton': 'hand21', 'cube_side': 0.3})
+    return path
+
+
+def depth_with_hand(z: float = 0.6) -> np.ndarray:
+    """(H, W) metres: a hand-sized disc before a far wall."""
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    disc = np.hypot(u - WIDTH / 2, v - HEIGHT / 2) < 0.06 * FOCAL / z
+    return np.where(disc, z, 3.0).astype(np.float32)
+
+
+def image(depth: np.ndarray, stamp: int = 1, frame: str = 'camera_optical', encoding: str = '16UC1') -> Image:
+    """A sensor_msgs/Image of a depth image in metres; `stamp` in milliseconds."""
+    data = (depth * 1000).astype(np.uint16) if encoding == '16UC1' else depth.astype(np.float32)
+    message = Image(height=depth.shape[0], width=depth.shape[1], encoding=encoding, step=data.strides[0],
+                    data=array('B', data.tobytes()))
+    return stamped(message, stamp, frame)
+
+
+def camera_info(width: int = WIDTH, height: int = HEIGHT, focal: float = FOCAL) -> CameraInfo:
+    k = [focal, 0.0, width / 2, 0.0, focal, height / 2, 0.0, 0.0, 1.0]
+    return stamped(CameraInfo(width=width, height=height, k=k), 1)
+
+
+def stamped(message, stamp: int, frame: str = 'camera_optical'):
+    message.header.stamp.sec, message.header.stamp.nanosec = stamp // 1000, stamp % 1000 * 1_000_000
+    message.header.frame_id = frame
+    return message
+
+
+def stamp_of(message) -> int:
+    return message.header.stamp.sec * 1000 + message.header.stamp.nanosec // 1_000_000
+
+
+class Rig:
+    """The node under test, and a camera and a listener in a node of their own, each with its executor and thread."""
+
+    def __init__(self, weights: Path) -> None:
+        self.weights = weights
+        self.context = rclpy.Context()
+        self.context.init()
+        self.client = Node('client', context=self.context)
+        self.received: dict[type, list] = {}
+        self.listen(HandJointsArray, 'hand/joints', RELIABLE)
+        self.listen(MarkerArray, 'hand/markers', RELIABLE)
+        self.listen(DiagnosticArray, '/diagnostics', RELIABLE)
+        self.listen(Log, '/rosout', QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+        self.executors, self.threads = [], []
+        self.node: EstimatorNode | None = None
+        self.spin(self.client)
+
+    def listen(self, kind: type, topic: str, qos: QoSProfile) -> None:
+        self.client.create_subscription(kind, topic, self.received.setdefault(kind, []).append, qos)
+
+    def spin(self, node: Node) -> None:
+        executor = SingleThreadedExecutor(context=self.context)
+        executor.add_node(node)
+        thread = threading.Thread(target=executor.spin, daemon=True)
+        thread.start()
+        self.executors.append(executor)
+        self.threads.append(thread)
+
+    def start(self, *remaps: str, **parameters) -> EstimatorNode:
+        """The node, with `min_score` 0: an untrained network is never sure."""
+        parameters = {'model': str(self.weights), 'min_score': 0.0, 'num_threads': 1, **parameters}
+        arguments = [word for rule in remaps for word in ('-r', rule)]
+        overrides = [Parameter(name.replace('__', '.'), value=value) for name, value in parameters.items()]
+        self.node = EstimatorNode(context=self.context, parameter_overrides=overrides,
+                                  cli_args=['--ros-args', *arguments] if arguments else None)
+        self.spin(self.node)
+        return self.node
+
+    def camera(self, qos: QoSProfile = BEST_EFFORT, kind: type = Image, topic: str = 'depth/image_rect',
+               info: CameraInfo | None = None) -> Callable[[object], None]:
+        """Connect a publisher of images (and of camera_info, once) and return its `publish`."""
+        images = self.client.create_publisher(kind, topic, qos)
+        self.until(lambda: images.get_subscription_count() and self.client.count_publishers('/hand/joints'))
+        if info is not None:
+            infos = self.client.create_publisher(CameraInfo, 'depth/camera_info', qos)
+            self.until(infos.get_subscription_count)
+            infos.publish(info)
+        return images.publish
+
+    def until(self, condition: Callable[[], object], what: str = 'it', seconds: float = 10.0) -> None:
+        deadline = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < deadline, f'waited in vain for {what}; the node said: {self.said()}'
+            time.sleep(0.002)
+
+    def answer(self, publish: Callable[[object], None], message) -> HandJointsArray:
+        """Publish one image and return the answer to it."""
+        answers = self.received[HandJointsArray]
+        before = len(answers)
+        publish(message)
+        self.until(lambda: len(answers) > before, 'an answer')
+        return answers[-1]
+
+    def said(self) -> list[str]:
+        return [log.msg for log in self.received[Log] if log.name.endswith('estimator')]
+
+    def until_said(self, *words: str) -> None:
+        self.until(lambda: any(all(word in text for word in words) for text in self.said()), f'a sentence with {words}')
+
+    def call(self, kind: type, service: str, **fields):
+        client = self.client.create_client(kind, f'/estimator/{service}')
+        assert client.wait_for_service(5)
+        return self.result(client.call_async(kind.Request(**fields)))
+
+    def result(self, future):
+        self.until(future.done, 'a service')
+        return future.result()
+
+    def transition(self, label: str) -> bool:
+        request = ChangeState.Request()
+        request.transition.label = label
+        return self.call(ChangeState, 'change_state', transition=request.transition).success
+
+    def state(self) -> str:
+        return self.call(GetState, 'get_state').current_state.label
+
+    def set_parameter(self, name: str, value) -> tuple[bool, str]:
+        client = AsyncParameterClient(self.client, 'estimator')
+        assert client.wait_for_services(5)
+        result = self.result(client.set_parameters([Parameter(name, value=value)])).results[0]
+        return result.successful, result.reason
+
+    def close(self) -> None:
+        for executor in self.executors:
+            executor.shutdown()
+        for thread in self.threads:
+            thread.join()
+        for node in (self.node, self.client):
+            if node is not None:
+                node.destroy_node()
+        self.context.shutdown()
+
+
+@pytest.fixture
+def rig(weights: Path, ros_domain: int) -> Iterator[Rig]:
+    rig = Rig(weights)
+    yield rig
+    rig.close()
+
+
+@pytest.mark.parametrize('qos', [BEST_EFFORT, RELIABLE], ids=['best effort', 'reliable'])
+def test_every_image_is_answered_once_with_its_own_stamp_and_frame(rig: Rig, qos: QoSProfile) -> None:
+    rig.start()
+    publish = rig.camera(qos, info=camera_info())
+    for i in range(20):
+        rig.answer(publish, image(depth_with_hand(), 1000 + 33 * i, f'frame_{i}'))
+    time.sleep(0.1)
+    answers = rig.received[HandJointsArray]
+    assert [(stamp_of(a), a.header.frame_id) for a in answers] == [(1000 + 33 * i, f'frame_{i}') for i in range(20)]
+    hand = answers[-1].hands[0]
+    assert answers[-1].skeleton == 'hand21'
+    assert len(hand.joints) == len(hand.confidence) == 21
+    assert all(0 <= c <= 1 for c in hand.confidence)
+    assert hand.cube_size == pytest.approx(0.3)
+    # The cube is where the hand is: straight ahead at 0.6 m.
+    assert (hand.cube_center.x, hand.cube_center.y, hand.cube_center.z) == pytest.approx((0, 0, 0.6), abs=0.15)
+
+
+@pytest.mark.parametrize('encoding', ['16UC1', '32FC1'])
+def test_both_encodings_give_the_same_hand(rig: Rig, encoding: str) -> None:
+    rig.start(tracking=False)
+    answer = rig.answer(rig.camera(info=camera_info()), image(depth_with_hand(), encoding=encoding))
+    assert len(answer.hands) == 1
+
+
+def test_no_hand_is_an_empty_answer_and_takes_the_markers_away(rig: Rig) -> None:
+    rig.start(marker_lifetime=2.0)
+    publish = rig.camera(info=camera_info())
+    hand = rig.answer(publish, image(depth_with_hand(), 1)).hands[0]
+    rig.until(lambda: rig.received[MarkerArray], 'markers')
+    shown = {(m.ns, m.id): m for m in rig.received[MarkerArray][-1].markers}
+    joints, bones = shown[f'{hand.id}/joints', 0], shown[f'{hand.id}/bones', 0]
+    assert (joints.type, len(joints.points), len(joints.colors)) == (Marker.SPHERE_LIST, 21, 21)
+    assert (bones.type, len(bones.points), len(bones.colors)) == (Marker.LINE_LIST, 40, 40)
+    assert all(m.action == Marker.ADD and m.lifetime.sec == 2 and m.header.frame_id == 'camera_optical'
+               for m in shown.values())
+
+    nothing = rig.answer(publish, image(np.full((HEIGHT, WIDTH), 3.0), 2))
+    assert stamp_of(nothing) == 2 and nothing.hands == []
+    rig.until(lambda: len(rig.received[MarkerArray]) > 1, 'deletions')
+    deleted = rig.received[MarkerArray][1].markers
+    assert {(m.ns, m.id) for m in deleted} == set(shown) and all(m.action == Marker.DELETE for m in deleted)
+
+    rig.answer(publish, image(np.full((HEIGHT, WIDTH), 3.0), 3))
+    rig.until(lambda: len(rig.received[MarkerArray]) > 2)
+    assert rig.received[MarkerArray][2].markers == []  # and once is enough
+
+
+def test_a_late_joiner_still_learns_the_skeleton(rig: Rig) -> None:
+    rig.start()
+    rig.answer(rig.camera(info=camera_info()), image(depth_with_hand()))
+    rig.listen(HandSkeleton, 'hand/skeleton', LATCHED)
+    rig.until(lambda: rig.received[HandSkeleton], 'the skeleton')
+    skeleton = rig.received[HandSkeleton][0]
+    assert skeleton.name == 'hand21' and tuple(skeleton.joint_names) == HAND21.joint_names
+    assert tuple(skeleton.parents) == HAND21.parents
+
+
+def test_compressed_depth(rig: Rig) -> None:
+    rig.start(transport='compressedDepth')
+    publish = rig.camera(kind=CompressedImage, topic='depth/image_rect/compressedDepth', info=camera_info())
+    for codec in ('png', 'rvl'):
+        layout, data = encode_compressed(depth_with_hand(), codec)
+        message = stamped(CompressedImage(format=layout, data=array('B', data)), 5, codec)
+        answer = rig.answer(publish, message)
+        assert len(answer.hands) == 1 and answer.header.frame_id == codec
+    rig.answer(publish, message)
+    publish(CompressedImage(format='16UC1; compressedDepth png', data=array('B', data[:40])))
+    rig.until_said('/depth/image_rect/compressedDepth', 'PNG')
+    rig.answer(publish, message)
+
+
+def test_a_remapped_image_takes_its_camera_info_along(rig: Rig) -> None:
+    rig.start('depth/image_rect:=/front/depth/image_raw')
+    publish = rig.camera(topic='/front/depth/image_raw')
+    infos = rig.client.create_publisher(CameraInfo, '/front/depth/camera_info', RELIABLE)
+    rig.until(infos.get_subscription_count, 'the camera_info beside the image')
+    infos.publish(camera_info())
+    assert rig.answer(publish, image(depth_with_hand())).hands
+
+
+def test_lifecycle(rig: Rig) -> None:
+    node = rig.start(autostart=False)
+    assert rig.state() == 'unconfigured'
+    assert rig.client.count_publishers('/hand/joints') == 0
+    assert rig.transition('configure') and rig.state() == 'inactive'
+    assert not rig.call(SetBool, 'enable', data=True).success
+    for _ in range(2):
+        assert rig.transition('activate')
+        publish = rig.camera(info=camera_info())
+        rig.answer(publish, image(depth_with_hand()))
+        assert rig.transition('deactivate') and rig.state() == 'inactive'
+        assert rig.client.count_subscribers('/depth/image_rect') == 0
+    estimator = weakref.ref(node._estimator)
+    assert rig.transition('cleanup') and rig.state() == 'unconfigured'
+    assert estimator() is None, 'the network must be gone after cleanup'
+    assert rig.transition('configure') and rig.transition('activate')
+    assert rig.answer(rig.camera(info=camera_info()), image(depth_with_hand())).hands
+    assert rig.transition('shutdown') and rig.state() == 'finalized'
+
+
+def test_unknown_weights_are_named_and_can_be_corrected(rig: Rig) -> None:
+    rig.start(model='/nowhere/weights.safetensors')
+    assert rig.state() == 'unconfigured'
+    rig.until_said('/nowhere/weights.safetensors')
+    assert rig.set_parameter('model', str(rig.weights))[0]
+    assert rig.transition('configure') and rig.transition('activate')
+    assert rig.answer(rig.camera(info=camera_info()), image(depth_with_hand())).hands
+
+
+def test_enable_and_reset(rig: Rig) -> None:
+    rig.start()
+    publish = rig.camera(info=camera_info())
+    first = rig.answer(publish, image(depth_with_hand(), 1)).hands[0].id
+    assert rig.answer(publish, image(depth_with_hand(), 2)).hands[0].id == first
+    assert rig.call(Trigger, 'reset').success
+    assert rig.answer(publish, image(depth_with_hand(), 3)).hands[0].id != first
+
+    assert rig.call(SetBool, 'enable', data=False).success
+    rig.until(lambda: rig.client.count_subscribers('/depth/image_rect') == 0)
+    rig.until(lambda: any(m.action == Marker.DELETE for m in rig.received[MarkerArray][-1].markers), 'deletions')
+    assert rig.call(SetBool, 'enable', data=True).success
+    assert rig.answer(rig.camera(info=camera_info()), image(depth_with_hand(), 4)).hands
+
+
+def test_a_bag_that_begins_again_is_a_new_hand(rig: Rig) -> None:
+    rig.start()
+    publish = rig.camera(info=camera_info())
+    ids = [rig.answer(publish, image(depth_with_hand(), stamp)).hands[0].id for stamp in (1000, 1033, 1066, 1000, 1033)]
+    assert ids[0] == ids[1] == ids[2] != ids[3] == ids[4]
+
+
+def test_parameters_change_between_images_or_are_refused_with_the_reason(rig: Rig) -> None:
+    rig.start()
+    publish = rig.camera(info=camera_info())
+    assert len(rig.answer(publish, image(depth_with_hand())).hands) == 1
+    assert rig.set_parameter('max_depth', 0.5)[0]
+    assert len(rig.answer(publish, image(depth_with_hand())).hands) == 0
+    assert rig.set_parameter('depth_scale', 0.0005)[0]  # the same numbers, half as far away
+    hand, = rig.answer(publish, image(depth_with_hand())).hands
+    assert hand.cube_center.z == pytest.approx(0.3, abs=0.1)
+    assert rig.set_parameter('cube_size', 0.25)[0]
+    assert rig.answer(publish, image(depth_with_hand())).hands[0].cube_size == pytest.approx(0.25)
+    assert rig.set_parameter('cube_size', 0.0)[0]
+    assert rig.answer(publish, image(depth_with_hand())).hands[0].cube_size == pytest.approx(0.3)
+
+    for name, value, reason in (('depth_scale', 2.0, 'range'), ('depth_scale', -1.0, 'range'), ('side', 'both', 'auto'),
+                                ('min_depth', 5.0, 'max_depth'), ('model', 'other', 'configured'),
+                                ('device', 'cuda', 'configured'), ('autostart', False, 'read'),
+                                ('max_hands', 0, 'range'), ('min_score', 'high', 'type')):
+        done, why = rig.set_parameter(name, value)
+        assert not done and reason in why.lower(), (name, why)
+    assert rig.answer(publish, image(depth_with_hand())).hands
+
+
+def test_without_camera_info_the_remedy_is_named_and_works(rig: Rig) -> None:
+    rig.start(camera_info_timeout=0.05)
+    publish = rig.camera()
+    publish(image(depth_with_hand()))
+    rig.until_said('/depth/camera_info', 'intrinsics.fx')
+    assert not rig.received[HandJointsArray]
+    node = rig.node
+    node.set_parameters_atomically([Parameter(f'intrinsics.{name}', value=value) for name, value in
+                                    (('fx', FOCAL), ('fy', FOCAL), ('cx', WIDTH / 2), ('cy', HEIGHT / 2))])
+    assert rig.answer(publish, image(depth_with_hand())).hands
+
+
+def test_an_image_waits_for_the_camera_info_that_comes_after_it(rig: Rig) -> None:
+    rig.start(camera_info_timeout=5.0)
+    publish = rig.camera()
+    infos = rig.client.create_publisher(CameraInfo, 'depth/camera_info', RELIABLE)
+    rig.until(infos.get_subscription_count)
+    publish(image(depth_with_hand(), 7))
+    infos.publish(camera_info())
+    rig.until(lambda: rig.received[HandJointsArray], 'the answer')
+    # The camera changes its resolution, and the image is here before its camera_info.
+    publish(image(depth_with_hand()[::2, ::2], 8))
+    infos.publish(camera_info(WIDTH // 2, HEIGHT // 2, FOCAL / 2))
+    rig.until(lambda: len(rig.received[HandJointsArray]) == 2, 'the second answer')
+    first, second = (answer.hands[0].cube_center for answer in rig.received[HandJointsArray])
+    assert (first.x, first.y, first.z) == pytest.approx((second.x, second.y, second.z), abs=0.2)
+
+
+def no_data(message: Image) -> None:
+    message.data = array('B')
+
+
+def colour(message: Image) -> None:
+    message.encoding = 'rgb8'
+
+
+def short(message: Image) -> None:
+    message.data = message.data[:-1]
+
+
+def empty(message: Image) -> None:
+    message.width = message.height = message.step = 0
+    message.data = array('B')
+
+
+def narrow_step(message: Image) -> None:
+    message.step = 3
+
+
+def wrong_size(message: Image) -> None:
+    message.height //= 2
+
+
+@pytest.mark.parametrize('harm, words', [
+    (colour, ['rgb8', '16UC1']), (no_data, ['0 bytes']), (short, ['bytes']), (empty, ['0x0']), (narrow_step, ['step']),
+    (wrong_size, ['camera_info', f'{WIDTH}x{HEIGHT // 2}'])])
+def test_a_bad_image_is_refused_with_one_sentence_and_the_next_one_is_answered(
+        rig: Rig, harm: Callable[[Image], None], words: list[str]) -> None:
+    rig.start(camera_info_timeout=0.01)
+    publish = rig.camera(RELIABLE, info=camera_info())
+    for stamp in range(3):
+        bad = image(depth_with_hand(), stamp)
+        harm(bad)
+        publish(bad)
+        time.sleep(0.05)
+    rig.until_said('/depth/', *words)
+    assert stamp_of(rig.answer(publish, image(depth_with_hand(), 99))) == 99
+    assert len([text for text in rig.said() if 'listening' not in text]) == 1, 'the same complaint, three times'
+
+
+@pytest.mark.parametrize('info, words', [
+    (camera_info(focal=0.0), ['not calibrated', 'intrinsics.fx']), (camera_info(WIDTH * 2, HEIGHT * 2), ['320x240']),
+    (camera_info(focal=float('nan')), ['nan'])])
+def test_bad_camera_info_is_refused_and_a_good_one_is_taken(rig: Rig, info: CameraInfo, words: list[str]) -> None:
+    rig.start(camera_info_timeout=0.01)
+    publish = rig.camera(info=info)
+    publish(image(depth_with_hand()))
+    rig.until_said('/depth/camera_info', *words)
+    assert not rig.received[HandJointsArray]
+    publish = rig.camera(info=camera_info())
+    rig.until(lambda: rig.node._camera._info.width == WIDTH and rig.node._camera._info.k[0] == FOCAL)
+    assert rig.answer(publish, image(depth_with_hand())).hands
+
+
+@pytest.mark.parametrize('value', [0.0, np.nan, np.inf, -np.inf, -1.0])
+def test_depth_without_readings_is_answered_and_explained(rig: Rig, value: float) -> None:
+    rig.start()
+    publish = rig.camera(info=camera_info())
+    answer = rig.answer(publish, image(np.full((HEIGHT, WIDTH), value), encoding='32FC1'))
+    assert answer.hands == []
+    rig.until_said('/depth/image_rect', 'no reading')
+    assert rig.answer(publish, image(depth_with_hand())).hands
+
+
+def test_a_wrong_depth_scale_is_suspected(rig: Rig) -> None:
+    rig.start()
+    rig.answer(rig.camera(info=camera_info()), image(depth_with_hand() * 10))
+    rig.until_said('/depth/image_rect', 'depth_scale')
+
+
+def test_silence_names_the_topic_and_its_publishers(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(node_module, 'SILENCE_S', 0.1)
+    rig.client.create_publisher(Image, '/somewhere/else', RELIABLE)
+    rig.start()
+    rig.until_said('/depth/image_rect', 'without any publisher', '/somewhere/else')
+
+
+def test_incompatible_quality_of_service_is_named_with_its_remedy(rig: Rig) -> None:
+    rig.start(**{'qos_overrides./depth/image_rect.subscription.reliability': 'reliable'})
+    rig.client.create_publisher(Image, 'depth/image_rect', BEST_EFFORT)
+    rig.until_said('/depth/image_rect', '/client', 'best effort',
+                   'qos_overrides./depth/image_rect.subscription.reliability')
+
+
+def test_diagnostics_tell_rates_times_and_hints(rig: Rig) -> None:
+    rig.start()
+    publish = rig.camera(info=camera_info())
+
+    def newest() -> dict[str, str]:
+        status = rig.received[DiagnosticArray][-1].status[0]
+        return {'message': status.message, 'level': status.level, **{v.key: v.value for v in status.values}}
+
+    for stamp in range(5):
+        rig.answer(publish, image(depth_with_hand(), stamp))
+    rig.until(lambda: rig.received[DiagnosticArray] and newest().get('answered_total') == '5', 'diagnostics')
+    report = newest()
+    assert report['received_total'] == '5' and report['dropped_total'] == '0' and report['state'] == 'active'
+    assert {'decode_p50_ms', 'predict_p50_ms', 'total_p95_ms', 'input_hz', 'output_hz'} <= report.keys()
+    assert report['level'] == b'\x00'
+    publish(Image(encoding='rgb8', width=1, height=1, step=3, data=array('B', b'abc')))
+    rig.until(lambda: 'rgb8' in newest()['message'] and newest()['level'] == b'\x01', 'a warning')
+    rig.until(lambda: newest()['level'] == b'\x03', 'staleness')
+
+
+def test_a_slow_network_gets_the_newest_image_never_a_queue(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    node = rig.start()
+    publish = rig.camera(RELIABLE, info=camera_info())
+    rig.answer(publish, image(depth_with_hand(), 1))
+    entered, go = threading.Event(), threading.Event()
+    run = node._estimator.engine.run
+
+    def slow(patches: np.ndarray) -> np.ndarray:
+        entered.set()
+        go.wait()
+        return run(patches)
+
+    monkeypatch.setattr(node._estimator.engine, 'run', slow)
+    publish(image(depth_with_hand(), 2))
+    entered.wait()
+    for stamp in range(3, 10):
+        publish(image(depth_with_hand(), stamp))
+    rig.until(lambda: node._statistics._totals['received'] == 9)
+    go.set()
+    rig.until(lambda: len(rig.received[HandJointsArray]) == 3)
+    time.sleep(0.1)
+    assert [stamp_of(a) for a in rig.received[HandJointsArray]] == [1, 2, 9]
+
+
+def test_many_activations_leave_nothing_behind(rig: Rig) -> None:
+    node = rig.start()
+    for _ in range(30):
+        assert rig.transition('deactivate') and rig.transition('activate')
+    assert len(list(node.subscriptions)) == 2
+    assert sum(thread.name == 'estimator' for thread in threading.enumerate()) == 1
+    assert rig.answer(rig.camera(info=camera_info()), image(depth_with_hand())).hands
+
+
+def test_the_command_starts_and_ends_cleanly(rig: Rig) -> None:
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'hand_pose_ros.cli', 'estimator', '--ros-args', '-p', f'model:={rig.weights}',
+         '-p', 'min_score:=0.0'], stderr=subprocess.PIPE, text=True, env=dict(os.environ))
+    try:
+        publish = rig.camera(info=camera_info())
+        assert rig.answer(publish, image(depth_with_hand())).hands
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=20)
+    finally:
+        process.kill()
+    assert process.returncode == 0
+    assert 'Traceback' not in errors
+
+
+def test_a_wrong_parameter_at_start_is_one_sentence() -> None:
+    done = subprocess.run([sys.executable, '-m', 'hand_pose_ros.cli', 'estimator', '--ros-args', '-p', 'depth_scale:=7.0'],
+                          capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1
+    assert 'depth_scale' in done.stderr and 'Traceback' not in done.stderr

@@ -15,12 +15,10 @@ def share_folder() -> Path:
         HandPoseError: the package was copied here without its files.
     """
     package = Path(__file__).absolute().parent  # not resolved: colcon --symlink-install links back into the source
-    for folder in (package.parent, *(prefix / "share" / package.name for prefix in package.parents)):
-        if (folder / "package.xml").is_file():
+    for folder in (package.parent, *(prefix / 'share' / package.name for prefix in package.parents)):
+        if (folder / 'package.xml').is_file():
             return folder
-    raise HandPoseError(
-        f"The files that belong to {package} are missing (no share/{package.name} above it): install with pip or colcon."
-    )
+    raise HandPoseError(f"No share/{package.name} with the package's files was found above {package}: reinstall it.")
 
 
 def resource(name: str) -> Path:
@@ -34,5 +32,5 @@ def resource(name: str) -> Path:
     """
     path = share_folder() / name
     if not path.is_file():
-        raise HandPoseError(f"{path} is missing: the package is older than its caller or not wholly installed; reinstall it.")
+        raise HandPoseError(f'{path} does not exist: reinstall the package with pip or colcon.')
     return path

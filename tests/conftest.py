@@ -7,18 +7,18 @@ from pathlib import Path
 import pytest
 
 # Generated messages check the type of every field only if asked to before they are imported; ROS 2 Humble always does.
-os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
+os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 
 _CHECKOUT = Path(__file__).resolve().parents[1]
 _domain = itertools.count(os.getpid() * 2)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope='session')
 def shared_data() -> Path:
     """Folder of recorded test data: $HAND_POSE_DATA, else ../shared/data beside the checkout; skips where absent."""
-    folder = Path(os.environ.get("HAND_POSE_DATA") or _CHECKOUT.parent / "shared" / "data")
+    folder = Path(os.environ.get('HAND_POSE_DATA') or _CHECKOUT.parent / 'shared' / 'data')
     if not folder.is_dir():
-        pytest.skip(f"no recorded test data in {folder}: set HAND_POSE_DATA to the folder that holds it")
+        pytest.skip(f'no recorded test data in {folder}: set HAND_POSE_DATA to the folder that holds it')
     return folder
 
 
@@ -28,8 +28,8 @@ def ros_domain(monkeypatch: pytest.MonkeyPatch) -> int:
 
     Ask for it before rclpy.init(), or for a whole file: `pytestmark = pytest.mark.usefixtures("ros_domain")`.
     """
-    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+    worker = int(os.environ.get('PYTEST_XDIST_WORKER', 'gw0').removeprefix('gw'))
     domain = 1 + (2 * next(_domain) + worker % 2) % 100  # above 101 the ports meet the ephemeral ones
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(domain))
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     return domain

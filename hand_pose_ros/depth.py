@@ -8,8 +8,6 @@ files. Messages are taken by their fields: those of rclpy, of a bag reader, or a
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hand_pose_ros.errors import InputError
+from hand_pose_ros.errors import InputError, naming
 
 DEPTH_ENCODINGS: dict[str, np.dtype[Any]] = {
     '16UC1': np.dtype('u2'), 'mono16': np.dtype('u2'), '32FC1': np.dtype('f4')}
@@ -42,7 +40,7 @@ def decode_image(msg: Any, depth_scale: float = 0.001, *, source: str = '') -> N
     Raises:
         InputError: not a depth encoding, an empty image, rows shorter than the width, or less data than rows.
     """
-    with _naming(source):
+    with naming(source):
         height, width, step = int(msg.height), int(msg.width), int(msg.step)
         if msg.encoding not in DEPTH_ENCODINGS:
             raise InputError(f"the encoding '{msg.encoding}' is not depth: choose a topic with one of "
@@ -74,7 +72,7 @@ def decode_compressed(msg: Any, depth_scale: float = 0.001, *, source: str = '')
     Raises:
         InputError: another format, or data that is corrupt.
     """
-    with _naming(source):
+    with naming(source):
         words = msg.format.replace(';', ' ').split()
         encoding = words[0] if words else ''
         if encoding not in DEPTH_ENCODINGS:
@@ -110,7 +108,7 @@ def read_png(path: str | Path, depth_scale: float = 0.001) -> NDArray[np.float32
     Raises:
         InputError: the file cannot be read, is not a PNG, is damaged, or has not 16 bits in one channel.
     """
-    with _naming(str(path)):
+    with naming(str(path)):
         try:
             data = Path(path).read_bytes()
         except OSError as error:
@@ -254,12 +252,3 @@ def _sanitised(depth: NDArray[np.float32]) -> NDArray[np.float32]:
     """A contiguous copy (H, W) in which everything that is not a positive finite number is 0."""
     depth = np.ascontiguousarray(depth, np.float32)
     return np.asarray(cv2.copyTo(depth, cv2.inRange(depth, _SMALLEST, _LARGEST)))
-
-
-@contextmanager
-def _naming(source: str) -> Iterator[None]:
-    """Begin the message of an InputError with the topic or file it is about."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(f'{source}: {error}' if source else str(error)) from None

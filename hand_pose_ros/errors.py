@@ -1,5 +1,8 @@
 """The exceptions of the package: one clear sentence each, naming the file, topic or value, and the remedy."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class HandPoseError(Exception):
     """Base of every error that this package raises on purpose."""
@@ -11,3 +14,12 @@ class InputError(HandPoseError):
 
 class CheckpointError(HandPoseError):
     """Weights that are missing, damaged, or of another kind than expected."""
+
+
+@contextmanager
+def naming(source: object) -> Iterator[None]:
+    """Begin the message of an InputError with the topic or file it is about; `source` may be empty."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f'{source}: {error}' if source else str(error)) from error

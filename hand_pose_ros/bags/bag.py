@@ -1,0 +1,199 @@
+"""A bag of any kind: its topics and its serialized messages, as far as they can be read."""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+from collections.abc import Collection, Iterator
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, BinaryIO, TypeVar
+
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Connection
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from hand_pose_ros.errors import InputError
+from hand_pose_ros.resources import resource
+
+IMAGE, COMPRESSED_IMAGE = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
+CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
+HAND, HANDS, SKELETON = (f'hand_pose_ros/msg/{name}' for name in ('HandJoints', 'HandJointsArray', 'HandSkeleton'))
+SIDES = ('unknown', 'left', 'right')
+"""The names of HandJoints.side, in the order of its constants."""
+
+_Self = TypeVar('_Self', bound='Bag')
+
+
+@lru_cache(maxsize=1)
+def typestore() -> Typestore:
+    """The message types of ROS 2 and of this package."""
+    store = get_typestore(Stores.LATEST)
+    for name in (HAND, HANDS, SKELETON):
+        store.register(get_types_from_msg(resource(f'msg/{name.rpartition("/")[2]}.msg').read_text(), name))
+    return store
+
+
+class Bag:
+    """Any bag, open for reading: a ROS 1 file, a ROS 2 folder, or one of its .mcap or .db3 files.
+
+    A ROS 2 folder without metadata.yaml and an MCAP file without its end, as interrupted recordings leave them, are
+    read as far as they go.
+
+    Raises:
+        InputError: the bag is missing, of no known kind, or damaged beyond what can be read.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        self._reader, self._interrupted = _open(self.path)
+        self.connections: list[Connection] = list(self._reader.connections)
+        self.is_ros1 = not self._reader.is2
+
+    def messages(self, connections: Collection[Connection],
+                 start: int | None = None) -> Iterator[tuple[Connection, int, bytes]]:
+        """Connection, time of recording [ns] and serialized data of each message, in the order of time.
+
+        Args:
+            start: leave out what was recorded before this time, ns.
+
+        Raises:
+            InputError: where the bag is damaged, after everything before the damage.
+        """
+        count = 0
+        try:
+            for message in self._reader.messages(connections=connections, start=start):
+                yield message
+                count += 1
+        except Exception as error:  # errors of sqlite and of the decompressors come through as they are
+            raise InputError(f'{self.path}: the bag is damaged after {count} messages ({error}); '
+                             f'{_remedy(self.path)}') from error
+        if self._interrupted:
+            raise InputError(f'{self.path}: the bag was cut short after {count} messages, as by an interrupted '
+                             f'recording or copy; {_remedy(self.path)}')
+
+    def first(self, connection: Connection) -> Any:
+        """The first message of a connection, None if it has none."""
+        if connection.msgcount == 0:
+            return None
+        _, _, data = next(self.messages([connection]))
+        return self.deserialize(connection, data)
+
+    def deserialize(self, connection: Connection, data: bytes) -> Any:
+        """The message as an object with the fields of its definition."""
+        try:
+            return self._reader.deserialize(data, connection.msgtype)
+        except Exception as error:  # whatever random bytes provoke
+            raise InputError(f'{self.path}: a message on {connection.topic} is damaged ({error}): record or copy '
+                             'the bag again') from error
+
+    def close(self) -> None:
+        """Close the files; the bag cannot be read any more."""
+        self._reader.close()
+
+    def __enter__(self: _Self) -> _Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _open(path: Path) -> tuple[AnyReader, bool]:
+    """A reader of the bag, and whether it only sees what an interrupted recording left."""
+    if not path.exists():
+        raise InputError(f'{path}: there is no such bag: check the path')
+    attempts: list[Any] = [path]
+    files = [file for kind in ('mcap', 'db3') for file in path.glob(f'*.{kind}')] if path.is_dir() else [path]
+    if len(files) == 1:
+        attempts += [files[0]] * path.is_dir() + [_InterruptedMcap(files[0])] * (files[0].suffix == '.mcap')
+    failure: Exception | None = None
+    for attempt in attempts:
+        try:
+            reader = AnyReader([attempt], default_typestore=typestore())
+            reader.open()
+            interrupted = isinstance(attempt, _InterruptedMcap)
+            if reader.connections or not interrupted:
+                return reader, interrupted
+            reader.close()  # not even the first chunk is complete
+        except Exception as error:  # errors of sqlite, YAML and of the decompressors come through as they are
+            failure = failure or error
+    raise InputError(f'{path}: the bag cannot be opened ({failure}); {_remedy(path)}') from failure
+
+
+def _remedy(path: Path) -> str:
+    if path.suffix == '.bag':
+        return f'if it was cut short, repair a copy with: rosbag reindex {path.name}'
+    if path.suffix == '.mcap':
+        return f'repair it with: mcap recover {path.name} -o repaired.mcap'
+    if path.suffix == '.db3':
+        return f'repair it with: sqlite3 {path.name} .recover | sqlite3 repaired.db3'
+    return ('give a .bag, .mcap or .db3 file or the folder of a ROS 2 bag, or repair that folder with: '
+            f'ros2 bag reindex {path.name}')
+
+
+class _InterruptedMcap:
+    """An MCAP file without its end, shown to rosbags as if it had been closed after its last complete record."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.suffix = path.suffix
+
+    def exists(self) -> bool:
+        return True
+
+    def is_dir(self) -> bool:
+        return False
+
+    def open(self, _mode: str) -> BinaryIO:
+        file = self._path.open('rb')
+        return io.BufferedReader(_Joined(file, _complete_records(file), _MCAP_END))
+
+
+_MCAP_MAGIC = b'\x89MCAP0\r\n'
+_MCAP_END = struct.pack('<BQQQI', 2, 20, 0, 0, 0) + _MCAP_MAGIC  # a footer that says that there is no summary
+
+
+def _complete_records(file: BinaryIO) -> int:
+    """Where the last complete record of the data section of an MCAP file ends."""
+    size = file.seek(0, io.SEEK_END)
+    end = len(_MCAP_MAGIC)
+    while end + 9 <= size:
+        file.seek(end)
+        kind, length = struct.unpack('<BQ', file.read(9))
+        if kind in (0x00, 0x02, 0x0f) or end + 9 + length > size:  # never written, footer, end of data
+            break
+        end += 9 + length
+    return end
+
+
+class _Joined(io.RawIOBase):
+    """The first `length` bytes of a file and `tail` behind them, as one file."""
+
+    def __init__(self, file: BinaryIO, length: int, tail: bytes) -> None:
+        self._file, self._length, self._tail, self._at = file, length, tail, 0
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        self._at = (0, self._at, self._length + len(self._tail))[whence] + offset
+        return self._at
+
+    def readinto(self, buffer: Any) -> int:
+        if self._at < self._length:
+            self._file.seek(self._at)
+            data = self._file.read(min(len(buffer), self._length - self._at))
+        else:
+            data = self._tail[self._at - self._length:][:len(buffer)]
+        buffer[:len(data)] = data
+        self._at += len(data)
+        return len(data)
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()

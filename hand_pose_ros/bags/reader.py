@@ -1,0 +1,223 @@
+"""Depth images with their intrinsics, and recorded hands, out of a bag."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.interfaces import Connection
+
+from hand_pose_ros.bags.bag import CAMERA_INFO, COMPRESSED_IMAGE, HANDS, IMAGE, SIDES, Bag
+from hand_pose_ros.depth import DEPTH_ENCODINGS, decode_compressed, decode_image
+from hand_pose_ros.errors import InputError, naming
+from hand_pose_ros.geometry import Intrinsics
+
+_TRANSPORTS = ('compressedDepth', 'compressed')
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One depth image of a bag. Depth and intrinsics are worked out when asked for, and may raise InputError.
+
+    Attributes:
+        stamp_ns: of the header.
+        frame_id: of the header.
+        topic: where it was recorded.
+    """
+
+    stamp_ns: int
+    frame_id: str
+    topic: str
+    _message: Any
+    _camera: Intrinsics | Sequence[float]
+    _depth_scale: float
+
+    @cached_property
+    def depth(self) -> NDArray[np.float32]:
+        """(H, W) metres, 0 = no reading."""
+        decode = decode_compressed if hasattr(self._message, 'format') else decode_image
+        return decode(self._message, self._depth_scale, source=self.topic)
+
+    @cached_property
+    def intrinsics(self) -> Intrinsics:
+        """Those of this image; the size of the camera_info is checked."""
+        height, width = self.depth.shape
+        if isinstance(self._camera, Intrinsics):
+            with naming(self.topic):
+                self._camera.check_size(width, height)
+            return self._camera
+        fx, fy, cx, cy = self._camera
+        return Intrinsics(fx, fy, cx, cy, width, height)
+
+
+class DepthBag(Bag):
+    """The depth images of a bag, each with the intrinsics of its camera: `for frame in DepthBag(path)`.
+
+    Args:
+        path: a bag of any kind.
+        depth_topic: sensor_msgs/Image or CompressedImage; can be left out if only one topic carries depth.
+        camera_info_topic: by default `camera_info` beside the depth topic.
+        intrinsics: (fx, fy, cx, cy) in pixels, instead of the camera_info.
+        depth_scale: metres per unit of 16-bit depth; by default 0.001.
+
+    Raises:
+        InputError: no depth topic, several to choose from, or no camera_info.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], depth_topic: str | None = None,
+                 camera_info_topic: str | None = None, intrinsics: tuple[float, float, float, float] | None = None,
+                 depth_scale: float | None = None) -> None:
+        super().__init__(path)
+        try:
+            self.depth_topic = depth_topic or self._find_depth_topic()
+            self._images = self._on_topic(self.depth_topic, (IMAGE, COMPRESSED_IMAGE), 'another depth topic')
+            self._infos: list[Connection] = []
+            if intrinsics is None:
+                beside = f'{_image_topic(self.depth_topic).rpartition("/")[0]}/camera_info'
+                self._infos = self._on_topic(camera_info_topic or beside, (CAMERA_INFO,),
+                                             'the topic of the camera_info, or the intrinsics fx fy cx cy')
+        except InputError:
+            self.close()
+            raise
+        self._intrinsics = intrinsics or ()
+        self._depth_scale = 0.001 if depth_scale is None else depth_scale
+
+    def __len__(self) -> int:
+        """How many depth images there are."""
+        return sum(connection.msgcount for connection in self._images)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """The frames in the order of recording, each with the newest camera_info of its frame_id.
+
+        Raises:
+            InputError: where the bag is damaged, after the frames before the damage.
+        """
+        cameras: dict[str, Intrinsics] = {}
+        count = 0
+        try:
+            for connection in self._infos:  # an image that was recorded before its camera_info takes the first one
+                self._remember(connection, self.first(connection), cameras)
+            for connection, _, data in self.messages([*self._images, *self._infos]):
+                message = self.deserialize(connection, data)
+                if connection.msgtype == CAMERA_INFO:
+                    self._remember(connection, message, cameras)
+                    continue
+                header = message.header
+                camera = self._intrinsics if not cameras else cameras.get(header.frame_id, cameras[''])
+                yield Frame(_stamp_ns(header), header.frame_id, self.depth_topic, message, camera, self._depth_scale)
+                count += 1
+        except InputError as error:
+            raise InputError(f'{error} ({count} of {len(self)} depth images were read)') from error
+
+    def _remember(self, connection: Connection, info: Any, cameras: dict[str, Intrinsics]) -> None:
+        """Keep the intrinsics as the newest of their frame_id, and as the newest of all under ''."""
+        if self.is_ros1:  # K, D, R and P became lower-case in ROS 2
+            info = SimpleNamespace(**{name.lower(): value for name, value in vars(info).items()})
+        with naming(f'{self.path}: {connection.topic}'):
+            cameras[info.header.frame_id] = cameras[''] = Intrinsics.from_camera_info(info)
+
+    def _find_depth_topic(self) -> str:
+        depth = {connection.topic for connection in self.connections if self._carries_depth(connection)}
+        # The transports of one image are one candidate, and the raw one needs the least work.
+        topics = sorted(topic for topic in depth if _image_topic(topic) == topic or _image_topic(topic) not in depth)
+        if len(topics) == 1:
+            return topics[0]
+        if topics:
+            raise InputError(f'{self.path}: several topics carry depth: choose one of {", ".join(topics)}')
+        raise InputError(f'{self.path}: no topic carries depth, as images in {", ".join(DEPTH_ENCODINGS)} or '
+                         f'compressedDepth do: choose another bag (this one has {self._topics()})')
+
+    def _carries_depth(self, connection: Connection) -> bool:
+        if connection.msgtype not in (IMAGE, COMPRESSED_IMAGE) or (message := self.first(connection)) is None:
+            return False
+        described = message.encoding if connection.msgtype == IMAGE else message.format.replace(';', ' ')
+        return described.split(' ')[0] in DEPTH_ENCODINGS
+
+    def _on_topic(self, topic: str, types: Sequence[str], remedy: str) -> list[Connection]:
+        found = [c for c in self.connections if c.topic == topic and c.msgtype in types and c.msgcount]
+        if not found:
+            raise InputError(f'{self.path}: there is no {_ros_name(types[0])} on {topic}: give {remedy} '
+                             f'(the bag has {self._topics()})')
+        return found
+
+    def _topics(self) -> str:
+        return ', '.join(sorted({f'{c.topic} [{_ros_name(c.msgtype)}]' for c in self.connections})) or 'no topics'
+
+
+@dataclass(frozen=True)
+class RecordedHands:
+    """The hands of one image, as a bag tells them.
+
+    Attributes:
+        stamp_ns: of the header, which is that of the depth image.
+        frame_id: of the header.
+        skeleton: name of the joint set.
+        joints: (hands, J, 3) float64, metres.
+        confidence: (hands, J) float32.
+        scores: (hands,) float32.
+        sides: 'left', 'right' or 'unknown', one per hand.
+        ids: one per hand.
+    """
+
+    stamp_ns: int
+    frame_id: str
+    skeleton: str
+    joints: NDArray[np.float64]
+    confidence: NDArray[np.float32]
+    scores: NDArray[np.float32]
+    sides: tuple[str, ...]
+    ids: tuple[str, ...]
+
+
+def read_hands(path: str | os.PathLike[str], topic: str | None = None) -> list[RecordedHands]:
+    """All HandJointsArray messages of a bag, in the order of recording.
+
+    Args:
+        topic: by default the only one of this type.
+
+    Raises:
+        InputError: no such topic, several to choose from, or a damaged bag.
+    """
+    with Bag(path) as bag:
+        found = [c for c in bag.connections if c.msgtype == HANDS and topic in (None, c.topic)]
+        topics = sorted({c.topic for c in found})
+        if len(topics) != 1:
+            raise InputError(f'{path}: needed is one topic of {_ros_name(HANDS)}{f" named {topic}" if topic else ""}, '
+                             f'but the bag has {", ".join(topics) or "none"}: give the name of the topic')
+        return [_recorded_hands(bag.deserialize(c, data), f'{path}: {topics[0]}') for c, _, data in bag.messages(found)]
+
+
+def _recorded_hands(message: Any, source: str) -> RecordedHands:
+    counts = {count for hand in message.hands for count in (len(hand.joints), len(hand.confidence))}
+    if len(counts) > 1:
+        raise InputError(f'{source}: the hands of one message have {sorted(counts)} joints and confidences: '
+                         'they must be as many as the skeleton has')
+    shape = (len(message.hands), max(counts, default=0))
+    joints = [[(point.x, point.y, point.z) for point in hand.joints] for hand in message.hands]
+    return RecordedHands(
+        _stamp_ns(message.header), message.header.frame_id, message.skeleton,
+        np.array(joints, np.float64).reshape(*shape, 3),
+        np.array([hand.confidence for hand in message.hands], np.float32).reshape(shape),
+        np.array([hand.score for hand in message.hands], np.float32),
+        tuple(SIDES[hand.side] if hand.side < len(SIDES) else 'unknown' for hand in message.hands),
+        tuple(hand.id for hand in message.hands))
+
+
+def _stamp_ns(header: Any) -> int:
+    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+
+
+def _image_topic(topic: str) -> str:
+    """The topic without its transport: /depth/image/compressedDepth -> /depth/image."""
+    base, _, last = topic.rpartition('/')
+    return base if last in _TRANSPORTS else topic
+
+
+def _ros_name(msgtype: str) -> str:
+    return msgtype.replace('/msg/', '/')

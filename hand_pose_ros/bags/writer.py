@@ -1,0 +1,179 @@
+"""Depth images, hands and other messages into a new ROS 2 bag."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.rosbag2 import StoragePlugin, Writer
+
+from hand_pose_ros.bags.bag import CAMERA_INFO, COMPRESSED_IMAGE, HAND, HANDS, IMAGE, SIDES, SKELETON, typestore
+from hand_pose_ros.depth import encode_compressed, to_units
+from hand_pose_ros.errors import InputError
+from hand_pose_ros.geometry import Cube, Intrinsics
+from hand_pose_ros.skeleton import HAND21, Skeleton
+
+_FOREVER = QosTime(2147483647, 4294967295)  # what rosbag2 writes for "no limit"
+
+
+class Hand(Protocol):
+    """What is written of a hand; hand_pose_ros.estimator.HandEstimate has it."""
+
+    @property
+    def id(self) -> str: ...
+    @property
+    def side(self) -> str: ...
+    @property
+    def score(self) -> float: ...
+    @property
+    def joints(self) -> NDArray[np.float32]: ...
+    @property
+    def confidence(self) -> NDArray[np.float32]: ...
+    @property
+    def cube(self) -> Cube: ...
+
+
+class BagWriter:
+    """Writes a bag that appears at `path` when it is complete: `with BagWriter(path) as bag: ...`.
+
+    After an error nothing is left at `path`, or what was there before.
+
+    Args:
+        path: a single file if it ends in .mcap or .db3, else the folder of a ROS 2 bag, which must not exist yet.
+        storage: 'mcap' or 'sqlite3', for a folder.
+
+    Raises:
+        InputError: the folder exists already, or cannot be written.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], storage: str = 'mcap') -> None:
+        self.path = Path(path)
+        self._is_file = self.path.suffix in ('.mcap', '.db3')
+        if self._is_file:
+            storage = 'mcap' if self.path.suffix == '.mcap' else 'sqlite3'
+        elif self.path.exists():
+            raise InputError(f'{self.path}: there is something already: give another name for the bag, or remove it')
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._work = Path(tempfile.mkdtemp(prefix=f'.{self.path.name}.', dir=self.path.parent))
+        except OSError as error:
+            raise InputError(f'{self.path}: the bag cannot be written ({error.strerror}): choose another place'
+                             ) from None
+        self._writer = Writer(self._work / self.path.stem, version=9, storage_plugin=StoragePlugin[storage.upper()])
+        self._writer.open()
+        self._connections: dict[str, Connection] = {}
+        self._types = typestore().types
+
+    def write(self, topic: str, msgtype: str, message: Any, stamp_ns: int, *, latched: bool = False) -> None:
+        """Write a message made of the types of rosbags (`hand_pose_ros.bags.bag.typestore().types`)."""
+        self.write_serialized(topic, msgtype, typestore().serialize_cdr(message, msgtype), stamp_ns, latched=latched)
+
+    def write_serialized(self, topic: str, msgtype: str, data: bytes | memoryview, stamp_ns: int, *,
+                         latched: bool = False) -> None:
+        """Write CDR bytes, such as those of rclpy.serialization.serialize_message.
+
+        Args:
+            msgtype: such as 'sensor_msgs/msg/Image'.
+            stamp_ns: time of recording.
+            latched: players offer the topic as transient local.
+        """
+        if topic not in self._connections:
+            qos = Qos(QosHistory.KEEP_LAST, 1 if latched else 10, QosReliability.RELIABLE,
+                      QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE,
+                      _FOREVER, _FOREVER, QosLiveliness.AUTOMATIC, _FOREVER, avoid_ros_namespace_conventions=False)
+            self._connections[topic] = self._writer.add_connection(
+                topic, msgtype, typestore=typestore(), offered_qos_profiles=[qos])
+        self._writer.write(self._connections[topic], stamp_ns, data)
+
+    def write_depth(self, stamp_ns: int, frame_id: str, depth: NDArray[np.float32], intrinsics: Intrinsics, *,
+                    topic: str = '/depth/image_rect', codec: str | None = 'png', depth_scale: float = 0.001) -> None:
+        """Write a depth image as 16UC1, and its camera_info beside it.
+
+        Args:
+            depth: (H, W) metres, 0 = no reading.
+            topic: of the raw image; with a codec, `/compressedDepth` is added.
+            codec: 'png' or 'rvl' for compressedDepth, None for raw images.
+            depth_scale: metres per unit.
+        """
+        header = self._header(stamp_ns, frame_id)
+        info = self._camera_info(header, intrinsics)
+        self.write(f'{topic.rpartition("/")[0]}/camera_info', CAMERA_INFO, info, stamp_ns)
+        if codec is None:
+            units = to_units(depth, depth_scale).astype('<u2')
+            height, width = units.shape
+            self.write(topic, IMAGE, self._types[IMAGE](
+                header=header, height=height, width=width, encoding='16UC1', is_bigendian=0, step=2 * width,
+                data=units.view(np.uint8).ravel()), stamp_ns)
+        else:
+            name, data = encode_compressed(depth, codec, depth_scale)
+            self.write(f'{topic}/compressedDepth', COMPRESSED_IMAGE, self._types[COMPRESSED_IMAGE](
+                header=header, format=name, data=np.frombuffer(data, np.uint8)), stamp_ns)
+
+    def write_hands(self, stamp_ns: int, frame_id: str, hands: Sequence[Hand], skeleton: Skeleton = HAND21,
+                    topic: str = '/hand/joints') -> None:
+        """Write a HandJointsArray: all hands of one image, none included."""
+        self.write(topic, HANDS, self._types[HANDS](
+            header=self._header(stamp_ns, frame_id), skeleton=skeleton.name,
+            hands=[self._hand(hand) for hand in hands]), stamp_ns)
+
+    def write_skeleton(self, stamp_ns: int, frame_id: str, skeleton: Skeleton, model: str, model_version: str,
+                       topic: str = '/hand/skeleton') -> None:
+        """Write what the joints mean (HandSkeleton), latched; once."""
+        self.write(topic, SKELETON, self._types[SKELETON](
+            header=self._header(stamp_ns, frame_id), name=skeleton.name, joint_names=list(skeleton.joint_names),
+            parents=np.array(skeleton.parents, np.int8), model=model, model_version=model_version),
+            stamp_ns, latched=True)
+
+    def close(self) -> None:
+        """Complete the bag and move it into place."""
+        self._writer.close()
+        made = self._writer.path
+        try:
+            os.replace(next(made.glob(f'*{self.path.suffix}')) if self._is_file else made, self.path)
+        finally:
+            shutil.rmtree(self._work, ignore_errors=True)
+
+    def abort(self) -> None:
+        """Give the bag up and leave nothing."""
+        self._writer.abort()
+        shutil.rmtree(self._work, ignore_errors=True)
+
+    def __enter__(self) -> BagWriter:
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self.abort()
+
+    def _header(self, stamp_ns: int, frame_id: str) -> Any:
+        sec, nanosec = divmod(stamp_ns, 1_000_000_000)
+        return self._types['std_msgs/msg/Header'](
+            stamp=self._types['builtin_interfaces/msg/Time'](sec=sec, nanosec=nanosec), frame_id=frame_id)
+
+    def _point(self, xyz: Sequence[float]) -> Any:
+        x, y, z = (float(value) for value in xyz)
+        return self._types['geometry_msgs/msg/Point'](x=x, y=y, z=z)
+
+    def _hand(self, hand: Hand) -> Any:
+        return self._types[HAND](
+            id=hand.id, side=SIDES.index(hand.side), score=float(hand.score),
+            joints=[self._point(joint) for joint in hand.joints], confidence=np.asarray(hand.confidence, np.float32),
+            cube_center=self._point(hand.cube.center), cube_size=float(hand.cube.side))
+
+    def _camera_info(self, header: Any, intrinsics: Intrinsics) -> Any:
+        k = np.array([[intrinsics.fx, 0, intrinsics.cx], [0, intrinsics.fy, intrinsics.cy], [0, 0, 1]], np.float64)
+        whole = self._types['sensor_msgs/msg/RegionOfInterest'](
+            x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+        return self._types[CAMERA_INFO](
+            header=header, height=intrinsics.height, width=intrinsics.width, distortion_model='plumb_bob',
+            d=np.zeros(5), k=k.ravel(), r=np.eye(3).ravel(), p=np.hstack([k, np.zeros((3, 1))]).ravel(),
+            binning_x=0, binning_y=0, roi=whole)

@@ -35,7 +35,7 @@ BONES = ('forearm', 'wrist', 'carpus', *(f'{f}_metacarpal' for f in FINGERS[1:])
 _RADIAL = (-1.0, -1.0, 1.0, 1.0)  # sign of the rotation about +z that abducts index, middle, ring and little finger
 _CMC_X, _CMC_Y = (0.50, 1.0, 0.63, 0.56), (0.165, 0.165, 0.175, 0.19)  # CMC over MCP, in x and y
 _SPLAY = (-1.5, 0.0, 2.5, 6.0)   # degrees about +z: directions of the fingers at abduction 0 ...
-_LEAN = (-7.0, 0.0, 6.0, 12.0)   # ... and about +y, positive leaning towards the thumb: the fingers of a fist converge
+_LEAN = (-5.0, 0.0, 4.0, 9.0)   # ... and about +y, positive leaning towards the thumb: the fingers of a fist converge
 
 
 def _axis_rotation(axis: int, angle: Tensor) -> Tensor:

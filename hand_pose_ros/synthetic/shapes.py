@@ -20,7 +20,7 @@ MEN, WOMEN = (0.183, 0.084), (0.166, 0.075)
 # Bones along each digit over hand length, to the end of the finger. Thumb: metacarpal, proximal, distal.
 _SEGMENTS = ((0.251, 0.196, 0.158), (0.251, 0.138, 0.112), (0.272, 0.163, 0.119), (0.253, 0.156, 0.117), (0.198, 0.117, 0.104))
 # Where the digits begin: x over hand breadth, y over hand length, z over hand breadth (the arch of the palm).
-_ROOTS = ((0.215, 0.105, 0.13), (0.252, 0.447, 0.02), (0.0, 0.446, 0.0), (-0.206, 0.422, 0.015), (-0.402, 0.382, 0.06))
+_ROOTS = ((0.215, 0.105, 0.13), (0.252, 0.447, 0.02), (0.0, 0.446, 0.0), (-0.220, 0.422, 0.015), (-0.415, 0.382, 0.06))
 # Half thickness of the flesh over half the breadth.
 _RADII = ((0.400, 0.232, 0.216), (0.231, 0.196, 0.176), (0.228, 0.199, 0.180), (0.212, 0.186, 0.169), (0.191, 0.166, 0.152))
 

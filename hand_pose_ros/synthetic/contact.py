@@ -1,0 +1,104 @@
+"""Keeps the parts of a hand out of each other: capsules around the bones, and poses nudged until none overlap."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from hand_pose_ros.synthetic.kinematics import INDEX, POSE, forward
+from hand_pose_ros.synthetic.shapes import Shape, mean_shape
+
+TOLERANCE, SQUEEZE = 0.002, 0.0045
+"""Metres by which capsules may overlap: flesh gives way where parts touch, more so between neighbouring fingers."""
+
+_ROUNDS = 14
+
+# Capsules: 0-2 thumb, 3-14 index to little finger (three each), 15-18 the palm along the metacarpals.
+_PAIRS = torch.tensor(
+    [(a, b) for a in (1, 2) for b in range(3, 19)]                                          # thumb: fingers, palm
+    + [(3 * i + a, 3 * j + b) for i in range(1, 5) for j in range(i + 1, 5) if j - i < 3 for a in range(3) for b in range(3)
+       if a + b > 0]                                                                        # finger: finger
+    + [(3 * i + a, b) for i in range(1, 5) for a in (1, 2) for b in (0, 15, 16, 17, 18)])   # finger: ball of the thumb, palm
+_FINGER = torch.cat([torch.arange(15) // 3, torch.full((4,), 5)])  # the digit of a capsule, 5 = palm
+_GIVE = torch.where((_FINGER[_PAIRS].min(1).values > 0) & (_FINGER[_PAIRS].max(1).values < 5), SQUEEZE, TOLERANCE)
+
+
+def _capsules(shape: Shape, pose: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Ends (B, 19, 3) and (B, 19, 3) and radii (B, 19) of the capsules."""
+    rotations, origins, joints = forward(shape, pose, torch.zeros_like(pose[0]))
+    digits = joints[:, 1:].reshape(-1, 5, 4, 3)
+    inwards = shape.palm_depth[:, None, None] * rotations[:, 3:7, :, 2]  # (B, 4, 3)
+    start = torch.cat([digits[:, :, :3].reshape(-1, 15, 3), origins[:, 3:7] + 0.35 * inwards], 1)
+    end = torch.cat([digits[:, :, 1:].reshape(-1, 15, 3), digits[:, 1:, 0] + 0.18 * inwards], 1)
+    radii = shape.radii * shape.radii.new_tensor([[0.8, 1, 0.95], *[[0.96, 1, 0.95]] * 4])
+    palm = 0.74 * shape.palm_depth[:, None].expand(-1, 4)
+    return start, end, torch.cat([radii.reshape(-1, 15), palm], 1).expand(len(pose), 19)
+
+
+def _segment_distance(p: Tensor, q: Tensor, r: Tensor, s: Tensor) -> Tensor:
+    """Least distance (...) between the segments p-q and r-s, (..., 3) each."""
+    u, v, w = q - p, s - r, p - r
+    a, b, c, d, e = (u * u).sum(-1), (u * v).sum(-1), (v * v).sum(-1), (u * w).sum(-1), (v * w).sum(-1)
+    t = ((b * e - c * d) / (a * c - b * b).clamp(1e-12)).clamp(0, 1)
+    k = ((b * t + e) / c.clamp(1e-12)).clamp(0, 1)
+    t = ((b * k - d) / a.clamp(1e-12)).clamp(0, 1)
+    return (w + t[..., None] * u - k[..., None] * v).norm(dim=-1)
+
+
+def overlaps(pose: Tensor, shape: Shape | None = None) -> Tensor:
+    """How deep the parts of hands are inside each other beyond what flesh gives way, in metres.
+
+    Args:
+        pose: (B, P) radians.
+        shape: B hands, or one for all; the average hand if left out.
+
+    Returns:
+        (B, 6, 6), symmetric: digits from thumb to little finger, then the palm; 0 where nothing overlaps.
+    """
+    shape = (shape or mean_shape()).to(pose.device)
+    start, end, radius = _capsules(shape, pose)
+    a, b = _PAIRS.to(pose.device).T
+    apart = _segment_distance(start[:, a], end[:, a], start[:, b], end[:, b])
+    deep = (radius[:, a] + radius[:, b] - apart - _GIVE.to(pose.device)).clamp(0)
+    finger = _FINGER.to(pose.device)
+    slot = (6 * finger[a] + finger[b]).expand(len(pose), -1)
+    table = torch.zeros(len(pose), 36, device=pose.device).scatter_reduce(1, slot, deep, 'amax').reshape(-1, 6, 6)
+    return torch.maximum(table, table.mT)
+
+
+def part_contacts(pose: Tensor) -> Tensor:
+    """Poses (B, P) near the given ones in which nothing overlaps (see `overlaps`), for the average hand.
+
+    The thumb is moved outwards, fingers that meet the palm open, fingers that meet each other come side by side. What is
+    still entangled after some rounds gives way towards an open hand.
+    """
+    pose = pose.clone()
+    open_thumb = torch.deg2rad(pose.new_tensor([46, 34, 80, 0, 4, 0]))
+    thumb = slice(INDEX['thumb_cmc_radial'], INDEX['thumb_ip_flexion'] + 1)
+    fingers = slice(INDEX['index_mcp_flexion'], len(POSE))
+    calm = torch.zeros(4, device=pose.device)
+    for _ in range(_ROUNDS):
+        deep = overlaps(pose)
+        if not (deep > 0).any():
+            return pose
+        amount = (deep / 0.012).clamp(0.08, 0.5) * (deep > 0)
+        by_thumb = amount[:, 0, 1:].amax(1, keepdim=True)
+        pose[:, thumb] = torch.lerp(pose[:, thumb], open_thumb, by_thumb)
+        digits = pose[:, fingers].reshape(-1, 4, 4)  # (B, finger, angle)
+        between = amount[:, 1:5, 1:5]
+        strength = between.amax(2)
+        partner = (between @ digits[..., 0::2]) / between.sum(2, keepdim=True).clamp(1e-6)  # what the others bend by
+        mean_bend = torch.where(strength[..., None] > 0, partner, digits[..., 0::2])
+        bend = torch.lerp(digits[..., 0::2], mean_bend, 0.5 * strength[..., None])
+        opening = 1 - 0.35 * amount[:, 1:5, 5].maximum(amount[:, 1:5, 0] * 0.3)
+        abduct = torch.lerp(digits[..., 1], calm, strength)
+        digits = torch.stack([bend[..., 0] * opening, abduct, bend[..., 1] * opening, digits[..., 3] * opening], -1)
+        pose[:, fingers] = digits.reshape(-1, 16)
+    stuck = (overlaps(pose) > 0).flatten(1).any(1)
+    harmless = torch.zeros_like(pose[0])
+    harmless[thumb] = open_thumb
+    harmless = torch.cat([pose[:, :4], harmless[4:].expand(len(pose), -1)], 1)
+    for part in (0.5, 1.0):
+        pose = torch.where(stuck[:, None], torch.lerp(pose, harmless, part), pose)
+        stuck = (overlaps(pose) > 0).flatten(1).any(1)
+    return pose

@@ -81,7 +81,7 @@ def detect(depth: NDArray[np.float32], intrinsics: Intrinsics, *, side: float = 
     present = z[unseen]
     if present.size == 0:
         return found
-    for limit in np.arange(present.min() + _SLAB_M, present.max() + _SLAB_M, _SLAB_M):
+    for limit in np.arange(present.min() + _SLAB_M, present.max() + 2 * _SLAB_M, _SLAB_M):
         nearer = (unseen & (z < limit)).view(np.uint8)
         count, labels, stats, _ = cv2.connectedComponentsWithStats(nearer, connectivity=4)
         for label in range(1, count):

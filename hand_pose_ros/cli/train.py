@@ -1,0 +1,59 @@
+"""hand-pose train: train a network from a recipe."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+EPILOG = """examples:
+  hand-pose train modern --out runs/modern
+  hand-pose train paper --out runs/deep-prior --set samples=1_000_000 --set augmentation=modern
+  hand-pose train paper --out runs/direct --set network=shallow --set options.bottleneck=none
+  hand-pose train paper --out runs/orref --set refiner=or_ref --set base=runs/deep-prior/best.safetensors
+  hand-pose train paper --out runs/nyu --set dataset=nyu --set root=/data/NYU
+  hand-pose train --out runs/modern --resume
+  torchrun --nproc-per-node 4 -m hand_pose_ros.cli train modern --out runs/modern --device cuda --workers 0
+
+recipes: paper, original-code, modern; docs/training.md says what they do and lists every value.
+"""
+
+
+def add_parser(subparsers: Any) -> None:
+    parser = subparsers.add_parser('train', help='train a network from a recipe', epilog=EPILOG,
+                                   formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('recipe', nargs='?', help='paper, original-code or modern (with --resume: that of the run)')
+    parser.add_argument('--out', type=Path, required=True, metavar='RUN', help='folder of the run')
+    parser.add_argument('--set', action='append', default=[], metavar='KEY=VALUE', dest='overrides',
+                        help='replace a value of the recipe; may be given several times')
+    parser.add_argument('--resume', action='store_true', help='continue the run in RUN')
+    parser.add_argument('--device', default='cpu', help='cpu or cuda (default: %(default)s)')
+    parser.add_argument('--workers', type=int, default=1,
+                        help='processes that render or decode samples; 0: on the device itself, for a GPU (default: %(default)s)')
+    parser.add_argument('--threads', type=int, help='threads of the training process (default: all cores)')
+    parser.add_argument('--cache', type=Path, default=Path('~/.cache/hand_pose_ros/samples').expanduser(),
+                        help='where rendered and decoded samples are kept for all runs (default: %(default)s)')
+    parser.add_argument('--cache-gb', type=float, default=40,
+                        help='delete the samples used longest ago beyond this size (default: %(default)s)')
+    parser.set_defaults(parser=parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    import logging
+
+    from tqdm.contrib.logging import logging_redirect_tqdm
+
+    from hand_pose_ros.training.distributed import process_group
+    from hand_pose_ros.training.loop import Machine, Run, resume_recipe
+    from hand_pose_ros.training.recipes import get_recipe
+
+    if args.resume and (args.recipe or args.overrides):
+        args.parser.error('--resume continues with the recipe of the run: give neither RECIPE nor --set')
+    if not args.resume and not args.recipe:
+        args.parser.error('give a RECIPE (paper, original-code or modern), or --resume')
+    logging.basicConfig(level=logging.INFO, format='%(message)s')
+    recipe = resume_recipe(args.out) if args.resume else get_recipe(args.recipe, args.overrides)
+    machine = Machine(args.cache, args.device, args.workers, args.threads, args.cache_gb)
+    with logging_redirect_tqdm(), process_group(args.device):
+        Run(args.out, recipe, machine).train(args.resume)
+    return 0

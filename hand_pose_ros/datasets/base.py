@@ -1,0 +1,131 @@
+"""What every dataset gives: crops of hands and their joints, whatever they were recorded or rendered with."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hand_pose_ros.errors import HandPoseError
+from hand_pose_ros.geometry import Cube, Intrinsics, crop
+from hand_pose_ros.skeleton import Skeleton
+
+Batch = dict[str, Tensor]
+"""Samples side by side, as the network sees them: left hands are mirrored, so that all are right hands.
+
+- `patch` (B, 1, 128, 128) float, in [-1, 1]
+- `joints` (B, J, 3) float32, cube units
+- `cube_center` (B, 3) and `cube_side` (B,) float32, metres: `joints_in_metres` needs them. The centre of a mirrored
+  patch is mirrored too (x negated)
+- `hand_present` (B,) bool: false where the patch shows no hand; its joints mean nothing then
+"""
+
+
+class DatasetError(HandPoseError):
+    """A dataset that is missing, incomplete or damaged."""
+
+
+class Dataset(ABC):
+    """Samples by index; what a sample holds depends on its index and on nothing else."""
+
+    name: str
+    """Tells this dataset and its part from others, for example 'nyu-train'."""
+    skeleton: Skeleton
+    size: int | None
+    """Number of samples; None = as many as one asks for."""
+    fingerprint: str
+    """Changes whenever the samples change: caches are kept under it."""
+
+    @abstractmethod
+    def batch(self, indices: Tensor) -> Batch:
+        """The samples of these indices (B,), see `Batch`."""
+
+
+@dataclass(frozen=True)
+class LabelledFrame:
+    """One recorded depth image with the joints of one hand."""
+
+    depth: NDArray[np.float32]
+    """(H, W) metres, 0 = no reading."""
+    intrinsics: Intrinsics
+    joints: NDArray[np.float64]
+    """(J, 3) metres, optical frame (x right, y down, z forward)."""
+    seed: NDArray[np.float64]
+    """(3,) metres: where the search for the hand starts; the label of the palm, as in the original code."""
+    cube_side: float
+    """Metres; depends on the size of the subject's hand in some protocols."""
+    left: bool = False
+
+
+class RecordedDataset(Dataset):
+    """Frames from disk. The crop follows the protocol of the original code (also used for its published numbers):
+    a cube at the *labelled* palm, the centre of mass of what is inside, and the cube again there.
+    """
+
+    @abstractmethod
+    def frame(self, index: int) -> LabelledFrame:
+        """The frame of this index, decoded.
+
+        Raises:
+            DatasetError: its file is missing or damaged.
+        """
+
+    def batch(self, indices: Tensor) -> Batch:
+        samples = [self._sample(self.frame(int(index))) for index in indices]
+        patches, joints, centers, sides = zip(*samples, strict=True)
+        return {
+            'patch': torch.from_numpy(np.stack(patches)),
+            'joints': torch.from_numpy(np.stack(joints).astype(np.float32)),
+            'cube_center': torch.tensor(centers, dtype=torch.float32),
+            'cube_side': torch.tensor(sides, dtype=torch.float32),
+            'hand_present': torch.ones(len(samples), dtype=torch.bool),
+        }
+
+    @staticmethod
+    def _sample(frame: LabelledFrame) -> tuple[NDArray[np.float32], NDArray[np.float64], tuple[float, ...], float]:
+        seed = Cube((float(frame.seed[0]), float(frame.seed[1]), float(frame.seed[2])), frame.cube_side)
+        cube = center_of_mass_cube(frame.depth, seed, frame.intrinsics)
+        patch, joints, center = crop(frame.depth, cube, frame.intrinsics), cube.to_cube(frame.joints), cube.center
+        if frame.left:
+            patch, joints = patch[..., ::-1], joints * (-1, 1, 1)
+            center = (-center[0], center[1], center[2])
+        return patch, joints, center, cube.side
+
+
+def center_of_mass_cube(depth: NDArray[np.float32], seed: Cube, intrinsics: Intrinsics) -> Cube:
+    """A cube of the same side at the centre of mass of what is inside `seed`, or `seed` where that is nothing.
+
+    As in the original code the mean is taken of column, row and depth, and projected back afterwards.
+    """
+    half, z = seed.side / 2, seed.center[2]
+    (u, v), reach_u, reach_v = intrinsics.project(seed.center), intrinsics.fx * half / z, intrinsics.fy * half / z
+    top, left = max(0, round(v - reach_v)), max(0, round(u - reach_u))
+    window = depth[top:max(0, round(v + reach_v)), left:max(0, round(u + reach_u))]
+    rows, columns = np.nonzero((window > z - half) & (window < z + half))
+    if not len(rows):
+        return seed
+    center = intrinsics.back_project((columns.mean() + left, rows.mean() + top), window[rows, columns].mean())
+    return Cube((float(center[0]), float(center[1]), float(center[2])), seed.side)
+
+
+def joints_in_metres(joints: Tensor, cube_center: Tensor, cube_side: Tensor) -> Tensor:
+    """Joints (B, J, 3) in cube units -> metres, for cubes (B, 3) and (B,): `Cube.from_cube`, batched."""
+    center = cube_center[:, None]
+    points = joints * (cube_side / 2)[:, None, None] + center
+    return torch.cat([points[..., :2] * (points[..., 2:] / center[..., 2:]), points[..., 2:]], dim=-1)
+
+
+def require_file(path: Path, dataset: str, what: str) -> Path:
+    """`path`, if it is there.
+
+    Raises:
+        DatasetError: it is not; the sentence says which file is expected where.
+    """
+    if not path.is_file():
+        raise DatasetError(f'{dataset}: {path} is missing ({what}); give the folder that holds it with --set root=FOLDER')
+    return path

@@ -1,0 +1,193 @@
+"""Samples rendered or decoded once and read many times.
+
+Shard i of a dataset always holds the samples [i N, (i + 1) N), so whoever makes it, and whenever, makes the same one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import multiprocessing
+import multiprocessing.connection
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from functools import partial
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from hand_pose_ros.datasets.base import Batch, Dataset, DatasetError
+
+_BATCH = 64  # samples made at a time: enough to be efficient, few enough to fit the caches
+
+
+def make_shard(dataset: Dataset, shard: int, shard_size: int) -> Batch:
+    """The samples of one shard; patches as float16, which is 0.04 mm in a cube of 0.3 m."""
+    end = (shard + 1) * shard_size if dataset.size is None else min((shard + 1) * shard_size, dataset.size)
+    parts = []
+    for indices in torch.arange(shard * shard_size, end).split(_BATCH):
+        part = dataset.batch(indices)
+        parts.append({**part, 'patch': part['patch'].half()})
+    return {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
+
+
+class MemoryShards:
+    """Shards made when they are first asked for, and kept on the device that made them: for rendering on a GPU."""
+
+    def __init__(self, dataset: Dataset, shard_size: int) -> None:
+        self.dataset, self.shard_size = dataset, shard_size
+        self._shards: dict[int, Batch] = {}
+
+    def keep(self, shards: Iterable[int]) -> None:
+        """From now on only these are needed."""
+        self._shards = {i: self._shards[i] for i in shards if i in self._shards}
+
+    def read(self, shard: int) -> Batch:
+        if shard not in self._shards:
+            self._shards[shard] = make_shard(self.dataset, shard, self.shard_size)
+        return self._shards[shard]
+
+    def close(self) -> None:
+        self._shards.clear()
+
+
+class DiskShards:
+    """Shards in files, made ahead by processes of their own and mapped into memory.
+
+    A file appears under its name only when it is complete and carries a checksum, so a run that is killed leaves
+    nothing half-made, and several runs can share a folder.
+
+    Args:
+        open_dataset: makes the dataset; called here and in every process, so it must be picklable.
+        folder: where the shards of all datasets are kept.
+        workers: processes that make shards.
+        limit_gb: delete the shards that were not used for longest when the folder grows beyond this.
+    """
+
+    AHEAD = 4
+    """How many shards beyond the needed ones are made in advance."""
+
+    def __init__(self, open_dataset: Callable[[], Dataset], folder: Path, shard_size: int, workers: int = 1,
+                 limit_gb: float = 40) -> None:
+        self.dataset, self.shard_size = open_dataset(), shard_size
+        self._folder = folder / f'{self.dataset.fingerprint}-{shard_size}'
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self._start_pool = partial(
+            ProcessPoolExecutor, workers, multiprocessing.get_context('spawn'), _start_worker,
+            (open_dataset, shard_size, folder, int(limit_gb * 1e9)))
+        self._pool: ProcessPoolExecutor | None = None
+        self._making: dict[int, Future[None]] = {}
+        self._open: dict[int, Batch] = {}
+
+    def path(self, shard: int) -> Path:
+        return self._folder / f'{shard:06d}.safetensors'
+
+    def keep(self, shards: Iterable[int]) -> None:
+        """From now on only these are needed: make those that are missing, in this order."""
+        needed = list(shards)
+        self._open = {i: self._open[i] for i in needed if i in self._open}
+        for shard in needed:
+            if shard not in self._making and not self.path(shard).exists():
+                self._pool = self._pool or self._start_pool()
+                self._making[shard] = self._pool.submit(_make_file, shard, self.path(shard))
+
+    def read(self, shard: int) -> Batch:
+        """The shard, as soon as it is there.
+
+        Raises:
+            DatasetError: a file of the dataset is missing or damaged.
+        """
+        while shard not in self._open:
+            if shard in self._making:
+                self._wait(shard)
+            try:
+                self._open[shard] = read_shard(self.path(shard))
+            except (FileNotFoundError, DatasetError):  # not made yet, deleted to make room, or damaged: make it
+                self.path(shard).unlink(missing_ok=True)
+                self.keep([*self._open, shard])
+        return self._open[shard]
+
+    def _wait(self, shard: int) -> None:
+        try:
+            self._making.pop(shard).result()
+        except BrokenProcessPool as error:
+            raise DatasetError(f'the process that makes samples of {self.dataset.name} was killed '
+                               '(is there enough memory?); continue with --resume') from error
+
+    def close(self) -> None:
+        """Stop making shards."""
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, cancel_futures=True)
+            self._pool = None
+
+
+def read_shard(path: Path) -> Batch:
+    """The tensors of a shard, mapped from its file.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        DatasetError: the file is damaged.
+    """
+    try:
+        with safe_open(path, 'pt') as file:
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
+            checksum = (file.metadata() or {}).get('sha256')
+    except SafetensorError as error:
+        raise DatasetError(f'{path} is damaged ({error}); delete it and it is made again') from error
+    if checksum != _checksum(tensors):
+        raise DatasetError(f'{path} does not match its checksum; delete it and it is made again')
+    os.utime(path)
+    return tensors
+
+
+def _checksum(tensors: Batch) -> str:
+    digest = hashlib.sha256()
+    for key in sorted(tensors):
+        digest.update(f'{key}{tuple(tensors[key].shape)}'.encode())
+        digest.update(memoryview(tensors[key].contiguous().reshape(-1).view(torch.uint8).numpy()))
+    return digest.hexdigest()
+
+
+_worker: tuple[Dataset, int, Path, int]
+"""In a process that makes shards: the dataset, the shard size, the folder of all shards and its limit in bytes."""
+
+
+def _start_worker(open_dataset: Callable[[], Dataset], shard_size: int, root: Path, limit: int) -> None:
+    global _worker
+    torch.set_num_threads(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the training run decides when to stop
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def leave_with_parent() -> None:
+        multiprocessing.connection.wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=leave_with_parent, daemon=True).start()
+    _worker = open_dataset(), shard_size, root, limit
+
+
+def _make_file(shard: int, path: Path) -> None:
+    dataset, shard_size, root, limit = _worker
+    if path.exists():  # another run was faster
+        return
+    tensors = {key: value.cpu().contiguous() for key, value in make_shard(dataset, shard, shard_size).items()}
+    temporary = path.with_suffix(f'.{os.getpid()}.tmp')
+    save_file(tensors, temporary, metadata={'sha256': _checksum(tensors)})
+    os.replace(temporary, path)
+    _limit_size(root, limit)
+
+
+def _limit_size(root: Path, limit: int) -> None:
+    """Delete the shards that were used longest ago; whoever has one open keeps it."""
+    files = [(path.stat().st_mtime, path.stat().st_size, path) for path in root.glob('*/*.safetensors')]
+    used = 0
+    for _, size, path in sorted(files, reverse=True):
+        used += size
+        if used > limit:
+            path.unlink(missing_ok=True)

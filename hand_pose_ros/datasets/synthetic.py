@@ -1,0 +1,42 @@
+"""Rendered hands: `hand_pose_ros.synthetic` seen as a dataset without an end."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+import hand_pose_ros.synthetic
+from hand_pose_ros.datasets.base import Batch, Dataset
+from hand_pose_ros.skeleton import HAND21
+
+LEFT = 1
+"""`side` of a left hand, as in the message HandJoints."""
+
+
+class Synthetic(Dataset):
+    """Endless samples of one split; 'train', 'val' and 'test' share no identity, no pose and no seed."""
+
+    name: str
+    skeleton = HAND21
+    size = None
+
+    def __init__(self, split: str, device: str = 'cpu') -> None:
+        from hand_pose_ros.synthetic.generator import SyntheticHands
+        self.name = f'synthetic-{split}'
+        self.device = torch.device(device)
+        self._hands = SyntheticHands(split, device=device)
+        # Any change of the code that makes the samples makes other samples.
+        sources = sorted(Path(hand_pose_ros.synthetic.__path__[0]).glob('*.py'))
+        code = hashlib.sha256(b''.join(path.read_bytes() for path in sources)).hexdigest()
+        self.fingerprint = f'{self.name}-{self.device.type}-{code[:12]}'
+
+    def batch(self, indices: Tensor) -> Batch:
+        hands = self._hands.batch(indices.to(self.device))
+        # The patch of a left hand comes mirrored; the centre of its cube must follow.
+        mirror = torch.where(hands['side'] == LEFT, -1.0, 1.0).to(self.device)
+        center = hands['cube_center'] * torch.stack([mirror, torch.ones_like(mirror), torch.ones_like(mirror)], dim=-1)
+        return {'patch': hands['patch'], 'joints': hands['joints'], 'cube_center': center,
+                'cube_side': hands['cube_side'], 'hand_present': hands['hand_present']}

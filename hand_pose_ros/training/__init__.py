@@ -1,0 +1,1 @@
+"""Training: recipes, data stream, augmentation, losses and the loop."""

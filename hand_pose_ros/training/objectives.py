@@ -1,0 +1,127 @@
+"""What is trained, with what it is trained for: a module from a batch to the terms of its loss."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from hand_pose_ros.datasets import Batch, joints_in_metres
+from hand_pose_ros.models.dense import encode
+from hand_pose_ros.skeleton import Skeleton
+from hand_pose_ros.synthetic.rng import Random
+from hand_pose_ros.training.losses import Terms, joint_loss
+from hand_pose_ros.training.recipes import Recipe
+
+
+class PoseObjective(nn.Module):
+    """A network that predicts joints."""
+
+    def __init__(self, network: nn.Module, recipe: Recipe) -> None:
+        super().__init__()
+        self.network, self.recipe = network, recipe
+
+    def forward(self, batch: Batch) -> Terms:
+        joints = self.network(batch['patch']).float()
+        return {'joints': joint_loss(self.recipe.loss, self.recipe.knee, joints, batch['joints'], _counts(batch))}
+
+    def predict(self, patch: Tensor) -> Tensor:
+        """(B, 1, 128, 128) -> joints (B, J, 3) in cube units, after training."""
+        return self.network(patch)
+
+
+class DenseObjective(PoseObjective):
+    """A network with maps of votes for the joints, and with what a tracker needs to know beside them.
+
+    - the votes themselves, not only what they add up to: every cell that sees something learns from every sample
+    - confidence: is the joint within 20 mm?
+    - hand: does the patch show one? side: is it shown the right way round?
+    - size: logarithm of the hand's length over the usual one, where 0.19 m in a cube of 0.30 m is usual: the network
+      sees the hand in its cube and nothing else
+    """
+
+    WEIGHTS = {'maps': 1.0, 'confidence': 0.01, 'hand': 0.01, 'side': 0.01, 'size': 0.01}
+    """The joints have 1; the others are there to be right, not to bend the features."""
+    CONFIDENT = 0.020
+    """Metres."""
+
+    def __init__(self, network: nn.Module, recipe: Recipe, skeleton: Skeleton) -> None:
+        super().__init__(network, recipe)
+        self.middle_finger = _chain(skeleton)
+
+    def forward(self, batch: Batch) -> Terms:
+        out = self.network.forward_full(batch['patch'])  # type: ignore[operator]
+        truth, counts, half = batch['joints'], _counts(batch), batch['cube_side'] / 2
+        joints = out['joints'].float()
+        directions, closeness = encode(out['positions'], truth)
+        seen = out['seen']  # (B, 1, 32, 32)
+        maps = (F.smooth_l1_loss(out['closeness'], closeness, reduction='none', beta=self.recipe.knee)
+                + F.smooth_l1_loss(out['directions'], directions, reduction='none', beta=self.recipe.knee).mean(2)) * seen
+        maps = maps.mean(1).sum((1, 2)) / seen.sum((1, 2, 3)).clamp(min=1)
+
+        with torch.no_grad():
+            right = (joints - truth).norm(dim=-1) * half[:, None] < self.CONFIDENT
+            cube = batch['cube_center'], batch['cube_side']
+            bones = joints_in_metres(truth, *cube)[:, self.middle_finger].diff(dim=1).norm(dim=-1)
+            size = torch.log((bones.sum(1) / batch['cube_side']).clamp(min=0.01) / (0.19 / 0.30))
+        extra = {
+            'maps': maps * counts,
+            'confidence': _binary(out['confidence'], right).mean(1) * counts,
+            'hand': _binary(out['hand'], batch['hand_present']),
+            'side': _binary(out['side'], ~batch['mirrored']) * batch['hand_present'],
+            'size': F.smooth_l1_loss(out['size'].float(), size, reduction='none', beta=0.1) * counts,
+        }
+        return {'joints': joint_loss(self.recipe.loss, self.recipe.knee, joints, truth, counts),
+                **{name: self.WEIGHTS[name] * value.mean() for name, value in extra.items()}}
+
+
+class RefinerObjective(nn.Module):
+    """A refiner over a first stage that stays as it is.
+
+    It must learn from errors as the first stage makes them on *new* data, so its samples are ones that the first stage
+    was not trained on. Jitter on top of the estimates shows it the errors between those that happen to occur; the second
+    iteration starts where the first one left off, as in use.
+    """
+
+    ITERATIONS = 2
+    JITTER = 0.03
+    """Standard deviation, cube units (4.5 mm in a cube of 0.3 m)."""
+
+    def __init__(self, refiner: nn.Module, base: nn.Module, recipe: Recipe) -> None:
+        super().__init__()
+        self.refiner, self.recipe = refiner, recipe
+        self._base = [base.eval().requires_grad_(False)]  # in a list: no part of what is trained, saved or averaged
+
+    def forward(self, batch: Batch) -> Terms:
+        estimate = self._estimate(batch['patch'])
+        estimate = estimate + Random(batch['numbers']).normal(*estimate.shape[1:], std=self.JITTER)
+        terms = {}
+        for i in range(self.ITERATIONS):
+            estimate = self.refiner(batch['patch'], estimate, iterations=1).float()
+            terms[f'joints_{i + 1}'] = joint_loss(
+                self.recipe.loss, self.recipe.knee, estimate, batch['joints'], _counts(batch))
+        return terms
+
+    def predict(self, patch: Tensor) -> Tensor:
+        return self.refiner(patch, self._estimate(patch), iterations=self.ITERATIONS)
+
+    def _estimate(self, patch: Tensor) -> Tensor:
+        with torch.no_grad():
+            return self._base[0].to(patch.device)(patch).float()
+
+
+def _counts(batch: Batch) -> Tensor:
+    """The samples whose joints count: with a hand, and shown with the right side."""
+    return batch['hand_present'] & ~batch['mirrored']
+
+
+def _binary(logits: Tensor, target: Tensor) -> Tensor:
+    return F.binary_cross_entropy_with_logits(logits.float(), target.float(), reduction='none')
+
+
+def _chain(skeleton: Skeleton) -> list[int]:
+    """The joints from the tip of the middle finger to the root: their bones make the length of the hand."""
+    chain = [skeleton.joint_names.index('middle_tip')]
+    while skeleton.parents[chain[-1]] >= 0:
+        chain.append(skeleton.parents[chain[-1]])
+    return chain

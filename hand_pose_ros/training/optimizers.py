@@ -1,0 +1,71 @@
+"""Optimisers and learning-rate schedules, by name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import nn
+from torch.optim import Optimizer
+
+from hand_pose_ros.errors import HandPoseError
+from hand_pose_ros.training.recipes import Recipe
+
+
+class FlooredRMSProp(Optimizer):
+    """RMSProp as in the original code: decay 0.9, and the root mean square floored at 0.01 instead of a small addition."""
+
+    def __init__(self, params: Any, lr: float) -> None:
+        super().__init__(params, {'lr': lr})
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], float] | None = None) -> None:  # type: ignore[override]
+        for group in self.param_groups:
+            for parameter in group['params']:
+                if parameter.grad is None:
+                    continue
+                state = self.state[parameter]
+                if not state:
+                    state['square'] = torch.zeros_like(parameter)
+                state['square'].mul_(0.9).addcmul_(parameter.grad, parameter.grad, value=0.1)
+                parameter.addcdiv_(parameter.grad, state['square'].sqrt().clamp_(min=0.01), value=-group['lr'])
+
+
+def make_optimizer(recipe: Recipe, network: nn.Module) -> Optimizer:
+    """The optimiser of a recipe for all parameters that want gradients; biases and norms are not decayed.
+
+    Raises:
+        HandPoseError: unknown name.
+    """
+    wanted = {name: p for name, p in network.named_parameters() if p.requires_grad}
+    decayed = {name for name, p in wanted.items() if p.ndim > 1 and 'bias' not in name}
+    groups = [{'params': [p for name, p in wanted.items() if name in decayed], 'weight_decay': recipe.weight_decay},
+              {'params': [p for name, p in wanted.items() if name not in decayed], 'weight_decay': 0.0}]
+    if recipe.optimizer == 'sgd':
+        return torch.optim.SGD(groups, lr=recipe.learning_rate, momentum=recipe.momentum)
+    if recipe.optimizer == 'rmsprop':
+        return FlooredRMSProp(list(wanted.values()), lr=recipe.learning_rate)
+    if recipe.optimizer == 'adamw':
+        return torch.optim.AdamW(groups, lr=recipe.learning_rate)
+    raise HandPoseError(f"unknown optimizer '{recipe.optimizer}': choose sgd, rmsprop or adamw")
+
+
+def learning_rate(recipe: Recipe, progress: float) -> float:
+    """The learning rate after this share of the budget, in [0, 1].
+
+    'constant'; 'hyperbolic', in steps by epoch, rate / (1 + 0.2 epoch) with the first epoch 1 (original code); 'cosine',
+    down to 0.
+
+    Raises:
+        HandPoseError: unknown schedule.
+    """
+    rate = recipe.learning_rate * (min(1.0, progress / recipe.warmup) if recipe.warmup else 1.0)
+    if recipe.schedule == 'constant':
+        return rate
+    if recipe.schedule == 'hyperbolic':
+        return rate / (1 + 0.2 * (1 + int(progress * recipe.epochs)))
+    if recipe.schedule == 'cosine':
+        return rate * 0.5 * (1 + math.cos(math.pi * progress))
+    raise HandPoseError(f"unknown schedule '{recipe.schedule}': choose constant, hyperbolic or cosine")

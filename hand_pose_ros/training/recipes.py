@@ -1,0 +1,162 @@
+"""What is trained on what, and how: one dataclass, three named recipes, any value replaceable on the command line."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+from hand_pose_ros.errors import HandPoseError
+from hand_pose_ros.training.augmentation import PRESETS, Augmentation
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """All that decides the result of a training run; the machine (device, processes, folders) does not."""
+
+    # Network
+    network: str = 'deep'
+    """A name of `hand_pose_ros.models.ARCHITECTURES`."""
+    options: dict[str, Any] = field(default_factory=lambda: {'bottleneck': 30})
+    """What the network takes, for example options.bottleneck=8, options.bottleneck=none (direct), options.width=48."""
+    train_prior: bool = True
+    """Train the reconstruction layer on after it was set to the principal components."""
+    refiner: str | None = None
+    """Train this refiner (std_ref or or_ref) on the estimates of `base`, whose weights stay as they are."""
+    base: str | None = None
+    """Checkpoint that the refiner corrects."""
+
+    # Data
+    dataset: str = 'synthetic'
+    root: str | None = None
+    """Folder of a recorded dataset."""
+    shard_size: int = 2048
+    reuse: int = 4
+    """How often a rendered sample is used, augmented anew each time."""
+    first_shard: int = 0
+    """Leave out what is before; a refiner on endless data starts behind what its base has seen by itself."""
+    last_shard: int | None = None
+    """Leave out what is from here on (recorded datasets)."""
+    augmentation: Augmentation = PRESETS['none']
+
+    # Optimisation
+    loss: str = 'huber'
+    knee: float = 0.1
+    optimizer: str = 'sgd'
+    learning_rate: float = 0.01
+    schedule: str = 'constant'
+    warmup: float = 0.0
+    """Share of the budget in which the learning rate rises linearly from 0."""
+    momentum: float = 0.9
+    weight_decay: float = 0.001
+    batch_size: int = 128
+    epochs: int = 100
+    samples: int | None = None
+    """Budget in samples seen; None = `epochs` passes. Endless data have no passes: an epoch is then 72,757 samples,
+    as many as the NYU training set has, or, with a budget, its `epochs`-th part."""
+    average: float = 0.0
+    """Decay per step of the running average of the weights that is validated and shipped; 0 = the weights themselves."""
+    seed: int = 23455
+
+    # Validation
+    val_samples: int = 2048
+    val_every: int = 65_536
+    """Samples between two validations."""
+
+
+EPOCH_OF_ENDLESS_DATA = 72_757
+
+RECIPES = {
+    # The paper, section 4.1. It gives neither the knee of its Huber loss nor a schedule: those are ours.
+    'paper': Recipe(),
+    # What the released code does: it never trains the prior's layer, and weight decay is inactive under dropout.
+    'original-code': Recipe(train_prior=False, loss='squared', optimizer='rmsprop', schedule='hyperbolic',
+                            momentum=0.0, weight_decay=0.0),
+    # A dense network (reference: AWR, A2J), every sample augmented, a loss that never stops caring about millimetres,
+    # AdamW with cosine decay, which needs no tuning per network, and averaged weights, worth a step of the decay.
+    'modern': Recipe(network='hand_dense', options={}, augmentation=PRESETS['modern'], loss='smooth_l1', knee=0.01,
+                     optimizer='adamw', learning_rate=2e-3, schedule='cosine', warmup=0.02, weight_decay=0.01,
+                     batch_size=64, samples=2_000_000, average=0.998),
+}
+
+T = TypeVar('T')
+
+
+def get_recipe(name: str, overrides: Iterable[str] = ()) -> Recipe:
+    """A named recipe with values replaced.
+
+    Args:
+        overrides: 'key=value' with a key of `Recipe`, dotted for the values inside one: 'learning_rate=0.003',
+            'options.bottleneck=8', 'augmentation.jitter=0.01', 'augmentation=modern', 'base=none'.
+
+    Raises:
+        HandPoseError: no such recipe or key, or a value of the wrong kind.
+    """
+    if name not in RECIPES:
+        raise HandPoseError(f"unknown recipe '{name}': choose one of {', '.join(RECIPES)}")
+    recipe = RECIPES[name]
+    for item in overrides:
+        key, equals, text = item.partition('=')
+        if not equals:
+            raise HandPoseError(f"--set {item}: write it as key=value")
+        recipe = _replace(recipe, key.split('.'), text, item)
+    return recipe
+
+
+def recipe_to_dict(recipe: Recipe) -> dict[str, Any]:
+    """For JSON."""
+    return dataclasses.asdict(recipe)
+
+
+def recipe_from_dict(values: dict[str, Any]) -> Recipe:
+    """The inverse of `recipe_to_dict`."""
+    return Recipe(**{**values, 'augmentation': Augmentation(**values['augmentation'])})
+
+
+def _replace(target: T, keys: list[str], text: str, item: str) -> T:
+    key = keys[0]
+    fields = {f.name: str(f.type) for f in dataclasses.fields(target)}  # type: ignore[arg-type]
+    if key not in fields:
+        raise HandPoseError(f"--set {item}: there is no '{key}'; choose one of {', '.join(fields)}")
+    if len(keys) > 1:
+        inner = getattr(target, key)
+        if isinstance(inner, dict):
+            value: Any = {**inner, keys[1]: _literal(text)}
+        elif dataclasses.is_dataclass(inner):
+            value = _replace(inner, keys[1:], text, item)
+        else:
+            raise HandPoseError(f"--set {item}: '{key}' is one value")
+    elif fields[key] == 'Augmentation':
+        if text not in PRESETS:
+            raise HandPoseError(f"--set {item}: choose one of {', '.join(PRESETS)}, or set one value: {key}.jitter=0.01")
+        value = PRESETS[text]
+    else:
+        value = _convert(text, fields[key], item)
+    return dataclasses.replace(target, **{key: value})  # type: ignore[type-var]
+
+
+def _literal(text: str) -> Any:
+    if text.lower() in ('none', 'true', 'false'):
+        text = text.capitalize()
+    try:
+        return ast.literal_eval(text.replace('_', '') if text.replace('_', '').isdigit() else text)
+    except (ValueError, SyntaxError):
+        return text
+
+
+def _convert(text: str, kind: str, item: str) -> Any:
+    """The value of a text for a field of this annotated type."""
+    value, kinds = _literal(text), kind.split(' | ')
+    if value is None and 'None' in kinds:
+        return None
+    if 'str' in kinds:
+        return text
+    if 'float' in kinds and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if 'int' in kinds and isinstance(value, float) and value.is_integer():  # 2e6
+        return int(value)
+    if type(value).__name__ in kinds:
+        return value
+    raise HandPoseError(f"--set {item}: '{text}' is not of type {kind}")

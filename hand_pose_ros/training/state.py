@@ -1,0 +1,64 @@
+"""Everything that a run needs to go on as if it had never stopped: one safetensors file, written in one step."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
+from hand_pose_ros.errors import CheckpointError
+
+
+def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, Any]) -> None:
+    """Write tensors and a JSON dictionary to one file that appears only when it is complete."""
+    temporary = path.with_name(f'.{path.name}.{os.getpid()}.tmp')
+    try:
+        save_file({key: value.detach().cpu().contiguous() for key, value in tensors.items()}, temporary,
+                  metadata={'json': json.dumps(metadata)})
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def save_state(path: Path, modules: dict[str, nn.Module], optimizer: Optimizer, progress: dict[str, Any]) -> None:
+    """Write modules, the state of the optimiser and plain values (step, best result)."""
+    tensors = {f'{name}.{key}': value for name, module in modules.items() for key, value in module.state_dict().items()}
+    for index, values in optimizer.state_dict()['state'].items():
+        tensors |= {f'optimizer.{index}.{key}': torch.as_tensor(value) for key, value in values.items()}
+    # A clone each: safetensors refuses tensors that share memory, as the averaged network's and the network's might.
+    save_tensors(path, {key: value.clone() for key, value in tensors.items()}, progress)
+
+
+def load_state(path: Path, modules: dict[str, nn.Module], optimizer: Optimizer) -> dict[str, Any]:
+    """Read back into the same modules and optimiser; returns the plain values.
+
+    Raises:
+        CheckpointError: no such file, it is damaged, or belongs to another network.
+    """
+    try:
+        with safe_open(path, 'pt') as file:
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+            progress = json.loads(file.metadata()['json'])
+        for name, module in modules.items():
+            module.load_state_dict(_under(tensors, name))
+    except FileNotFoundError as error:
+        raise CheckpointError(f'{path} is missing: there is nothing to resume; start without --resume') from error
+    except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise CheckpointError(f'{path} cannot be resumed from: {error}') from error
+    state: dict[int, dict[str, Tensor]] = {}
+    for key, value in _under(tensors, 'optimizer').items():
+        index, name = key.split('.', 1)
+        state.setdefault(int(index), {})[name] = value
+    optimizer.load_state_dict({'state': state, 'param_groups': optimizer.state_dict()['param_groups']})
+    return progress
+
+
+def _under(tensors: dict[str, Tensor], name: str) -> dict[str, Tensor]:
+    return {key[len(name) + 1:]: value for key, value in tensors.items() if key.startswith(f'{name}.')}

@@ -1,0 +1,98 @@
+"""Which samples a training step sees: a pure function of (seed, step), so that a resumed run continues bit for bit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from hand_pose_ros.datasets import Batch
+from hand_pose_ros.datasets.shards import DiskShards, MemoryShards
+
+
+class SampleStream:
+    """Samples in *stages*. A stage shows, in random order, every sample of a window of shards once.
+
+    - Of a finite dataset the window is all of it, so a stage is an epoch.
+    - Of an endless one the window slides: stage s shows the `reuse` shards up to s, so every sample is used `reuse`
+      times (each time augmented differently) while the shards of later stages are being rendered. Training needs
+      a new sample only for every `reuse` that it consumes, and starts as soon as the first shard is there.
+
+    Args:
+        first: shards before this one are left out; what a refiner sees, its first stage must not have seen.
+        last: shards from this one on are left out (finite datasets only).
+        part: (rank, world size): this process takes its equal part of every batch.
+    """
+
+    def __init__(self, shards: DiskShards | MemoryShards, batch_size: int, seed: int, reuse: int = 1,
+                 first: int = 0, last: int | None = None, part: tuple[int, int] = (0, 1)) -> None:
+        self.shards, self.batch_size, self.seed, self.reuse = shards, batch_size, seed, reuse
+        self.first, self.part = first, part
+        size, n = shards.dataset.size, shards.shard_size
+        self._window: range | None = None
+        self._end = -1
+        if size is not None:
+            self._window = range(first, min(-(-size // n), last if last is not None else size))
+            self._end = min(self._window.stop * n, size) - first * n
+        self._stage: tuple[int, NDArray[np.int64]] | None = None
+
+    def epoch_size(self) -> int | None:
+        """Samples in a pass over a finite dataset."""
+        return self._end if self._window is not None else None
+
+    def batch(self, step: int) -> tuple[Batch, torch.Tensor]:
+        """The samples of a step (patches as float32), and their numbers (B,) in the order of consumption."""
+        rank, world = self.part
+        share = self.batch_size // world
+        start = step * self.batch_size + rank * share
+        numbers = np.arange(start, start + share)
+        parts = []
+        while len(numbers):
+            stage, offset, size = self._locate(int(numbers[0]))
+            here = numbers[:size - offset]
+            parts += self._read(stage, offset, len(here))
+            numbers = numbers[len(here):]
+        batch = {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
+        batch['patch'] = batch['patch'].float()
+        return batch, torch.arange(start, start + share)
+
+    def shards_used(self, step: int) -> int:
+        """One past the last shard that the steps before this one have seen."""
+        if self._window is not None:
+            return self._window.stop
+        return self.first + self._locate(max(0, step * self.batch_size - 1))[0] + 1
+
+    def window(self, stage: int) -> range:
+        """The shards that a stage shows."""
+        if self._window is not None:
+            return self._window
+        return range(self.first + max(0, stage - self.reuse + 1), self.first + stage + 1)
+
+    def _locate(self, number: int) -> tuple[int, int, int]:
+        """The stage of a sample, its place in it, and the size of the stage."""
+        if self._window is not None:
+            return number // self._end, number % self._end, self._end
+        n, k = self.shards.shard_size, self.reuse
+        rising = n * k * (k - 1) // 2  # the first k - 1 stages show 1, 2, ... k - 1 shards
+        if number >= rising:
+            return k - 1 + (number - rising) // (n * k), (number - rising) % (n * k), n * k
+        stage = next(s for s in range(k) if number < n * (s + 1) * (s + 2) // 2)
+        return stage, number - n * stage * (stage + 1) // 2, n * (stage + 1)
+
+    def _read(self, stage: int, offset: int, count: int) -> Iterator[Batch]:
+        n, window = self.shards.shard_size, self.window(stage)
+        if self._stage is None or self._stage[0] != stage:
+            size = self._locate_size(window)
+            self._stage = stage, np.random.default_rng((self.seed, stage)).permutation(size)
+            ahead = range(window.stop, window.stop + DiskShards.AHEAD) if self._window is None else ()
+            self.shards.keep([*window, *ahead])
+        order = self._stage[1][offset:offset + count]
+        for shard in np.unique(order // n):
+            tensors = self.shards.read(window[int(shard)])
+            rows = torch.from_numpy(np.sort(order[order // n == shard] % n))
+            yield {key: value[rows.to(value.device)] for key, value in tensors.items()}
+
+    def _locate_size(self, window: range) -> int:
+        return self._end if self._window is not None else len(window) * self.shards.shard_size

@@ -22,6 +22,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from hand_pose_ros.datasets.base import Batch, Dataset, DatasetError
+from hand_pose_ros.datasets.memory import keep_freed_memory
 
 _BATCH = 64  # samples made at a time: enough to be efficient, few enough to fit the caches
 
@@ -160,6 +161,7 @@ _worker: tuple[Dataset, int, Path, int]
 def _start_worker(open_dataset: Callable[[], Dataset], shard_size: int, root: Path, limit: int) -> None:
     global _worker
     torch.set_num_threads(1)
+    keep_freed_memory()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the training run decides when to stop
     parent = multiprocessing.parent_process()
     assert parent is not None

@@ -21,6 +21,7 @@ from torch.nn.parallel import DistributedDataParallel
 from tqdm import tqdm
 
 from hand_pose_ros.datasets import Batch, joints_in_metres, open_dataset
+from hand_pose_ros.datasets.memory import keep_freed_memory
 from hand_pose_ros.datasets.shards import DiskShards, MemoryShards
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.models import build
@@ -67,6 +68,7 @@ class Run:
         self.rank, self.world = int(os.environ.get('RANK', 0)), int(os.environ.get('WORLD_SIZE', 1))
         if recipe.batch_size % self.world:
             raise TrainingError(f'a batch of {recipe.batch_size} cannot be shared equally by {self.world} processes')
+        keep_freed_memory()
         if machine.threads:
             torch.set_num_threads(machine.threads)
         torch.manual_seed(recipe.seed)
@@ -82,7 +84,10 @@ class Run:
         self.budget = recipe.samples or recipe.epochs * (self.stream.epoch_size() or EPOCH_OF_ENDLESS_DATA)
         self.steps = -(-self.budget // recipe.batch_size)
 
-        self.objective = self._make_objective(base).to(self.device)
+        if recipe.precision not in ('float32', 'bfloat16'):
+            raise TrainingError(f"unknown precision '{recipe.precision}': choose float32 or bfloat16")
+        # Channels last is what fast convolutions of few channels want, and twice as fast for them on a CPU.
+        self.objective = self._make_objective(base).to(self.device, memory_format=torch.channels_last)
         self.averaged = copy.deepcopy(self.objective) if recipe.average else self.objective
         self.optimizer = make_optimizer(recipe, self.objective)
         self.step, self.best_mm = 0, float('inf')
@@ -203,7 +208,8 @@ class Run:
         return terms
 
     def _autocast(self) -> AbstractContextManager[Any]:
-        return torch.autocast('cuda', torch.bfloat16) if self.device.type == 'cuda' else nullcontext()
+        half = self.recipe.precision == 'bfloat16'
+        return torch.autocast(self.device.type, torch.bfloat16) if half else nullcontext()
 
     @torch.no_grad()
     def _update_average(self) -> None:

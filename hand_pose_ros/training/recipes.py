@@ -56,6 +56,9 @@ class Recipe:
     samples: int | None = None
     """Budget in samples seen; None = `epochs` passes. Endless data have no passes: an epoch is then 72,757 samples,
     as many as the NYU training set has, or, with a budget, its `epochs`-th part."""
+    precision: str = 'float32'
+    """'float32', or 'bfloat16' for the convolutions and matrix products of the forward and backward pass: two to four
+    times as fast, on a GPU and on a CPU that has the instructions (avx512_bf16, amx)."""
     average: float = 0.0
     """Decay per step of the running average of the weights that is validated and shipped; 0 = the weights themselves."""
     seed: int = 23455
@@ -78,7 +81,7 @@ RECIPES = {
     # AdamW with cosine decay, which needs no tuning per network, and averaged weights, worth a step of the decay.
     'modern': Recipe(network='hand_dense', options={}, augmentation=PRESETS['modern'], loss='smooth_l1', knee=0.01,
                      optimizer='adamw', learning_rate=2e-3, schedule='cosine', warmup=0.02, weight_decay=0.01,
-                     batch_size=64, samples=2_000_000, average=0.998),
+                     batch_size=64, samples=2_000_000, precision='bfloat16', average=0.998),
 }
 
 T = TypeVar('T')

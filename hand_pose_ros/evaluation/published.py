@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import gzip
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -146,6 +146,26 @@ def load_published(predictions: str | Path, truth: str | Path, dataset: Dataset,
         parts=dict(dataset.parts) if whole else {}, notes=notes,
         info={'predictions': str(predictions), 'ground_truth': str(truth), 'dataset': dataset.name,
               'intrinsics': f'fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g}'})
+
+
+def load_result(source: str, truth: str | Path | None = None, dataset: Dataset | None = None,
+                intrinsics: Intrinsics | None = None) -> Result:
+    """A result by `FILE` or `NAME=FILE`: an .npz file that `Result.save` wrote, or predictions as text.
+
+    Args:
+        truth, dataset, intrinsics: for text, as in `load_published`.
+
+    Raises:
+        InputError: the file cannot be used, or it is text and there is no truth to it.
+    """
+    name, _, path = source.partition('=') if '=' in source and not Path(source).exists() else ('', '', source)
+    if Path(path).suffix == '.npz':
+        result = Result.load(path)
+    elif truth is None or dataset is None:
+        raise InputError(f'{path}: predictions as text need --ground-truth and --dataset')
+    else:
+        result = load_published(path, truth, dataset, intrinsics)
+    return replace(result, name=name) if name else result
 
 
 def _match_counts(guess: Labels, label: Labels, dataset: Dataset) -> Match:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from base64 import b64encode
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
@@ -27,8 +27,8 @@ from hand_pose_ros.geometry import Cube, Intrinsics
 from hand_pose_ros.skeleton import FINGERS
 
 Depth = NDArray[np.float32]
-ReadDepth = Callable[[int], 'Depth | None']
-"""Row of the result -> its depth image (H, W) in metres, or None where there is none."""
+ReadDepths = Callable[[Sequence[int]], Mapping[int, Depth]]
+"""Rows of the result -> their depth images (H, W) in metres, as far as there are any."""
 
 _VIEW_SIDE_M = 0.30
 _CLOUD_POINTS = 2500
@@ -45,12 +45,12 @@ _DEFINITIONS = (
 )
 
 
-def write_report(results: Sequence[Result], folder: str | Path, read_depth: ReadDepth | None = None) -> Path:
+def write_report(results: Sequence[Result], folder: str | Path, read_depths: ReadDepths | None = None) -> Path:
     """Write report.html, and its plots alone as PNG and SVG, into a folder.
 
     Args:
         results: the one that the report is about, then those it is compared with (of the same skeleton).
-        read_depth: gives the depth images behind the overlays and the 3D views.
+        read_depths: gives the depth images behind the overlays and the 3D views.
 
     Returns:
         The path of report.html.
@@ -63,7 +63,7 @@ def write_report(results: Sequence[Result], folder: str | Path, read_depth: Read
     figures = _figures([r for r in results if r.truth is not None], result)
     for name, figure in figures.items():
         plots.save(figure, folder / name)
-    cards = _cards(result, read_depth)
+    cards = _cards(result, read_depths)
     sections = [
         _section('Notes', ''.join(f'<p>{escape(note)}</p>' for note in result.notes), 'notes') if result.notes else '',
         _tiles(summary),
@@ -73,8 +73,8 @@ def write_report(results: Sequence[Result], folder: str | Path, read_depth: Read
             ('joints', 'Which joints are hard', _fingers(results)),
             ('errors', 'When it errs', ''),
             ('latency', 'What a frame costs', _latency(summary))) if name in figures),
-        _section('Frames', '<p class="soft">Drag to turn, wheel to zoom, double-click to go back. Coloured per finger: '
-                 'the estimate; dashed: the truth; grey: the depth image.</p><div class="frames">'
+        _section('Frames', '<p class="soft">On the depth image: the estimate and, where it is known, the truth. In 3D '
+                 '(drag to turn, wheel to zoom, double-click to go back) the truth is dashed.</p><div class="frames">'
                  + ''.join(card.html for card in cards) + '</div>') if cards else '',
         _section('Where this comes from', _table(
             ('', ''), sorted((key, str(value)) for key, value in result.info.items()), text=True)),
@@ -110,15 +110,17 @@ class _Hand:
     score: float = 1.0
 
 
-def _cards(result: Result, read_depth: ReadDepth | None) -> list[_Card]:
+def _cards(result: Result, read_depths: ReadDepths | None) -> list[_Card]:
     cards: list[_Card] = []
-    for title, row in _interesting_frames(result):
+    shown = _interesting_frames(result)
+    depths = read_depths([row for _, row in shown]) if read_depths else {}
+    for title, row in shown:
         estimate = result.predictions[row]
         truth = result.truth[row] if result.truth is not None else np.full_like(estimate, np.nan)
         known = truth if np.isfinite(truth).all() else estimate
         center = np.nanmean(known, axis=0)
         cube = Cube((float(center[0]), float(center[1]), float(center[2])), _VIEW_SIDE_M)
-        depth = read_depth(row) if read_depth else None
+        depth = depths.get(row)
         picture = ''
         if depth is not None:
             panels = [close_up(depth, result.intrinsics, _Hand(joints.astype(np.float32), cube), result.skeleton)
@@ -146,7 +148,8 @@ def _interesting_frames(result: Result) -> list[tuple[str, int]]:
     if not order:
         return []
     rows = (order[0], order[len(order) // 2], order[-1])
-    return [(f'{name}: frame {row + 1}{tail}', row) for name, row, tail in zip(names, rows, tails, strict=True)]
+    shown = {row: f'{name}: frame {row + 1}{tail}' for name, row, tail in zip(names, rows, tails, strict=True)}
+    return [(title, row) for row, title in shown.items()]
 
 
 def _cloud(depth: Depth, intrinsics: Intrinsics, cube: Cube) -> list[int]:
@@ -168,8 +171,9 @@ def _millimetres(joints: NDArray[np.floating[Any]], cube: Cube) -> list[list[flo
 def _figures(scored: Sequence[Result], result: Result) -> dict[str, Figure]:
     figures = {}
     if result.truth is not None:
-        figures = {'curves': plots.curves(scored), 'joints': plots.joint_bars(scored),
-                   'errors': plots.over_time(result)}
+        figures = {'curves': plots.curves(scored), 'joints': plots.joint_bars(scored)}
+    if np.isfinite(metrics.frame_means_mm(result.errors_mm)).sum() > 1:
+        figures['errors'] = plots.over_time(result)
     if result.seconds:
         figures['latency'] = plots.latency(result)
     return figures

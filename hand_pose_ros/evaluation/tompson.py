@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -37,6 +38,12 @@ def read_nyu_depth(path: str | Path) -> NDArray[np.float32]:
     millimetres = picture[..., 1].astype(np.float32) * 256 + picture[..., 0]
     millimetres[millimetres == _NO_DATA_MM] = 0
     return millimetres / np.float32(1000)
+
+
+def read_nyu_depths(folder: str | Path, rows: Sequence[int]) -> dict[int, NDArray[np.float32]]:
+    """The depth images (H, W) in metres of rows of the test set that are in the folder, as depth_1_%07d.png from 1."""
+    paths = {row: Path(folder) / f'depth_1_{row + 1:07d}.png' for row in rows}
+    return {row: read_nyu_depth(path) for row, path in paths.items() if path.is_file()}
 
 
 def lift(pixels: NDArray[np.float64], depth: NDArray[np.float32], intrinsics: Intrinsics, palm_z: float,
@@ -92,14 +99,14 @@ def load_tompson(predictions: str | Path, truth: str | Path, folder: str | Path,
                          'the protocol needs all 8252 test frames of --dataset nyu, 14 joints each')
     camera, points = dataset.intrinsics, label.points(dataset.intrinsics)
     lifted = np.full(points.shape, np.nan)
-    paths = {row: Path(folder) / f'depth_1_{row + 1:07d}.png' for row in range(dataset.frames)}
-    there = [row for row, path in paths.items() if path.is_file()]
+    there = []
+    for row in range(dataset.frames):
+        for depth in read_nyu_depths(folder, [row]).values():  # one by one: all of them are 10 GB
+            side = next(SIDES_M[part] for part, (start, stop) in dataset.parts.items() if start <= row < stop)
+            lifted[row] = lift(pixels[row], depth, camera, points[row, PALM, 2], side, points[row, :, 2], protocol)
+            there.append(row)
     if not there:
         raise InputError(f'{folder}: none of depth_1_0000001.png to depth_1_{dataset.frames:07d}.png is there')
-    for row in there:
-        side = next(SIDES_M[part] for part, (start, stop) in dataset.parts.items() if start <= row < stop)
-        lifted[row] = lift(pixels[row], read_nyu_depth(paths[row]), camera, points[row, PALM, 2], side,
-                           points[row, :, 2], protocol)
     notes = [f"2D joints lifted with the depth image, protocol '{protocol}'; the cube is centred on the labelled palm."]
     if len(there) < dataset.frames:
         points[np.setdiff1d(np.arange(dataset.frames), there)] = np.nan

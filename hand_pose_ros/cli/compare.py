@@ -1,0 +1,89 @@
+"""`hand-pose compare`: several results side by side."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hand_pose_ros.cli.evaluate import print_summaries
+from hand_pose_ros.errors import InputError
+from hand_pose_ros.evaluation import metrics
+from hand_pose_ros.evaluation.published import DATASETS, load_result
+from hand_pose_ros.evaluation.results import Result, write_json
+
+EXAMPLES = """examples:
+  hand-pose compare a.npz b.npz --out plots
+  hand-pose compare 'before=a.npz' 'after=b.npz' --json difference.json
+  hand-pose compare DeepPrior.txt.gz DeepPrior-ORRef.txt.gz --ground-truth labels.txt.gz --dataset nyu --out plots
+
+The first result is the one that the others are compared with, frame by frame: a difference whose interval does not
+hold 0 is more than chance on these frames.
+"""
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add this verb to the command line."""
+    parser = subparsers.add_parser(
+        'compare', help='several results side by side', epilog=EXAMPLES,
+        description='Tables and curves of any number of results, and confidence intervals of their differences.',
+        formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.set_defaults(error=parser.error)
+    parser.add_argument('results', nargs='+', metavar='[NAME=]FILE',
+                        help='.npz of `hand-pose evaluate --out`, or predictions as text')
+    parser.add_argument('--ground-truth', metavar='G', help='labels of the predictions that are text')
+    parser.add_argument('--dataset', choices=sorted(DATASETS), help='joints and camera of predictions that are text')
+    parser.add_argument('--json', metavar='FILE', help='write all numbers there')
+    parser.add_argument('--out', metavar='FOLDER', help='write report.html, and curves and bars as PNG and SVG, there')
+    parser.add_argument('--block', type=int, default=30, metavar='N',
+                        help='frames that are drawn together in the bootstrap, because they err alike (default: 30)')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Compare, print, and write what was asked for."""
+    if len(args.results) < 2:
+        args.error('give at least two results')
+    if args.block < 1:
+        args.error('--block must be at least 1')
+    dataset = DATASETS[args.dataset] if args.dataset else None
+    results = [load_result(source, args.ground_truth, dataset) for source in args.results]
+    for result in results:
+        for note in result.notes:
+            print(f'NOTE: {result.name}: {note}', file=sys.stderr)
+        if result.truth is None:
+            raise InputError(f'{result.name} has no ground truth to be compared on: evaluate it with --ground-truth')
+    summaries = [result.summary() for result in results]
+    print_summaries(zip((result.name for result in results), summaries, strict=True))
+    first, differences = results[0], []
+    for other in results[1:]:
+        reason = _not_paired(first, other)
+        if reason:
+            print(f'NOTE: {other.name} and {first.name} {reason}: no interval for their difference', file=sys.stderr)
+            continue
+        difference, low, high = metrics.paired_bootstrap(
+            metrics.frame_means_mm(other.errors_mm), metrics.frame_means_mm(first.errors_mm), block=args.block)
+        print(f'{other.name} - {first.name}: {difference:+.3f} mm, 95 % interval {low:+.3f} to {high:+.3f}')
+        differences.append({'result': other.name, 'minus': first.name, 'mean_mm': difference,
+                            'interval_mm': [low, high]})
+    if args.json:
+        write_json({'results': summaries, 'differences': differences}, args.json)
+    if args.out:
+        from hand_pose_ros.evaluation.report import write_report
+        if any(result.skeleton != first.skeleton for result in results):
+            raise InputError('results with different joints cannot be drawn into one picture: leave out --out')
+        print(f'report: {write_report(results, Path(args.out))}')
+    return 0
+
+
+def _not_paired(a: Result, b: Result) -> str:
+    """Why two results cannot be compared frame by frame, '' if they can."""
+    assert a.truth is not None and b.truth is not None
+    if a.predictions.shape != b.predictions.shape:
+        return f'have {len(a.predictions)} and {len(b.predictions)} frames' if a.skeleton == b.skeleton \
+            else 'have different joints'
+    if not np.allclose(a.truth, b.truth, atol=1e-6, equal_nan=True):
+        return 'were evaluated on different truth'
+    return ''

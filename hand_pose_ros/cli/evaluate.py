@@ -1,0 +1,196 @@
+"""`hand-pose evaluate`: score a prediction file, or the estimator on bags."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tqdm import tqdm
+
+from hand_pose_ros.errors import HandPoseError, InputError
+from hand_pose_ros.evaluation import published, tompson
+from hand_pose_ros.evaluation.results import Result, write_json
+from hand_pose_ros.evaluation.tables import ACCURACY_COLUMNS, accuracy_rows, number, text_table
+
+if TYPE_CHECKING:
+    from hand_pose_ros.evaluation.bag_evaluation import Settings
+
+EXAMPLES = """examples:
+  hand-pose evaluate --predictions NYU.txt.gz --ground-truth labels.txt.gz --dataset nyu --report out
+  hand-pose evaluate recording.mcap --report out
+  hand-pose evaluate recording.mcap --ground-truth /truth/joints --json result.json --out result.npz
+  hand-pose evaluate day1/*.bag --depth-topic /camera/depth/image_rect --intrinsics 476 476 314 243 --out results
+  torchrun --nproc-per-node 4 --no-python hand-pose evaluate bags/*.mcap --out results
+
+Text files have a frame a line, `u v d` for each joint: pixels and millimetres; gzipped or not, behind a file name
+or not.
+"""
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add this verb to the command line."""
+    parser = subparsers.add_parser(
+        'evaluate', help='score a prediction file, or the estimator on a bag', epilog=EXAMPLES,
+        description='Score predictions in a text file against labels, or run the estimator over bags and score it, or '
+                    'only time it if there is no ground truth.', formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.set_defaults(error=parser.error)
+    parser.add_argument('bags', nargs='*', metavar='BAG', help='a ROS 1 file, a ROS 2 folder, or an .mcap or .db3 file')
+    parser.add_argument('--ground-truth', metavar='G', help='text file of labels; with a bag also an .npz file with '
+                        'joints (frames, joints, 3) in metres, or a topic of the bag with HandJointsArray')
+    parser.add_argument('--json', metavar='FILE', help='write all numbers there')
+    parser.add_argument('--report', metavar='FOLDER', help='write report.html and the plots there')
+    parser.add_argument('--out', metavar='FILE', help='write the result (.npz) there, for `hand-pose compare`; with '
+                        'several bags a folder')
+    parser.add_argument('--compare', nargs='+', default=[], metavar='[NAME=]FILE',
+                        help='other results for the report: .npz of --out, or text of the same dataset')
+    parser.add_argument('--intrinsics', nargs=4, type=float, metavar=('FX', 'FY', 'CX', 'CY'),
+                        help='pixels, instead of those of the dataset or of camera_info')
+    text = parser.add_argument_group('predictions as text')
+    text.add_argument('--predictions', metavar='P', help='text file; or an .npz file with 2D joints `uv` of NYU, which '
+                      'are lifted with --depth-folder')
+    text.add_argument('--dataset', choices=sorted(published.DATASETS), help='joints and camera')
+    text.add_argument('--depth-folder', metavar='FOLDER', help='depth_1_%%07d.png of NYU, for overlays and 2D joints')
+    text.add_argument('--protocol', choices=('paper', 'code'), default='paper',
+                      help='2D joints beside the hand get the depth of the back face of the cube (paper, the default), '
+                      'or their true depth (the code of the paper, which favours them)')
+    bags = parser.add_argument_group('bags')
+    bags.add_argument('--model', help='name of weights that ship, or a checkpoint')
+    bags.add_argument('--device', default='auto', help='auto (default), cpu, cuda or cuda:N')
+    bags.add_argument('--side', choices=('auto', 'left', 'right'), default='auto', help='which hand it is')
+    bags.add_argument('--cube-size', type=float, metavar='M', help='side of the cube in metres')
+    bags.add_argument('--min-score', type=float, metavar='S', help='hands with a lower score are not counted as found')
+    bags.add_argument('--depth-topic', metavar='TOPIC', help='needed if several topics carry depth')
+    bags.add_argument('--camera-info-topic', metavar='TOPIC', help='if it is not beside the depth topic')
+    bags.add_argument('--depth-scale', type=float, metavar='M', help='metres per unit of 16-bit depth (0.001)')
+    bags.add_argument('--out-bag', metavar='BAG', help='write /hand/joints there, to be played beside the original; '
+                      'with several bags a folder')
+    bags.add_argument('--jobs', type=int, metavar='N', help='bags at the same time (default: one per core)')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Evaluate, print, and write what was asked for; 1 if a bag failed or was damaged."""
+    if bool(args.bags) == bool(args.predictions):
+        args.error('give either bags or --predictions')
+    if args.predictions:
+        return _run_text(args)
+    return _run_bag(args) if len(args.bags) == 1 else _run_bags(args)
+
+
+def _run_text(args: argparse.Namespace) -> int:
+    if not args.ground_truth or not args.dataset:
+        args.error('--predictions needs --ground-truth and --dataset')
+    dataset = published.DATASETS[args.dataset]
+    if args.intrinsics:
+        fx, fy, cx, cy = args.intrinsics
+        dataset = replace(dataset, intrinsics=replace(dataset.intrinsics, fx=fx, fy=fy, cx=cx, cy=cy))
+    if Path(args.predictions).suffix == '.npz':
+        if not args.depth_folder:
+            args.error('2D joints need --depth-folder')
+        result = tompson.load_tompson(args.predictions, args.ground_truth, args.depth_folder, dataset, args.protocol)
+    else:
+        result = published.load_published(args.predictions, args.ground_truth, dataset)
+    others = [published.load_result(source, args.ground_truth, dataset) for source in args.compare]
+    read_depths = partial(tompson.read_nyu_depths, args.depth_folder) if args.depth_folder else None
+    _deliver(args, result, others, read_depths)
+    return 0
+
+
+def _run_bag(args: argparse.Namespace) -> int:
+    from hand_pose_ros.evaluation.bag_evaluation import evaluate_bag, read_depths
+
+    settings = _settings(args)
+    result = evaluate_bag(args.bags[0], settings, progress=_progress('frames'), hands_bag=args.out_bag)
+    others = [published.load_result(source) for source in args.compare]
+    _deliver(args, result, others, lambda rows: read_depths(args.bags[0], rows, settings))
+    return int(result.info['damaged'])
+
+
+def _run_bags(args: argparse.Namespace) -> int:
+    from hand_pose_ros.evaluation.bag_evaluation import evaluate_bags, read_depths
+
+    if args.compare:
+        args.error('--compare works with one bag, not with several')
+    settings, names = _settings(args), _names(args.bags)
+    hands_bags = {bag: Path(args.out_bag) / f'{names[bag]}.mcap' for bag in args.bags} if args.out_bag else {}
+    outcomes = evaluate_bags(args.bags, settings, args.jobs, _progress('bags'), hands_bags)
+    summaries: dict[str, Any] = {}
+    for bag, outcome in outcomes.items():
+        print(f'\n{bag}')
+        if isinstance(outcome, HandPoseError):
+            print(f'FAILED: {outcome}', file=sys.stderr)
+            summaries[str(bag)] = {'error': str(outcome)}
+            continue
+        result = replace(outcome, name=names[str(bag)])
+        summaries[str(bag)] = result.summary()
+        single = argparse.Namespace(
+            json=None, report=args.report and Path(args.report) / result.name,
+            out=args.out and Path(args.out) / f'{result.name}.npz')
+        _deliver(single, result, [], lambda rows, bag=bag: read_depths(bag, rows, settings))  # type: ignore[misc]
+    if args.json and outcomes:
+        write_json({'bags': summaries}, args.json)
+    failed = [bag for bag, summary in summaries.items() if 'error' in summary or summary['damaged']]
+    if failed:
+        print(f'\n{len(failed)} of {len(summaries)} bags failed or are damaged: {", ".join(failed)}', file=sys.stderr)
+    return int(bool(failed))
+
+
+def _settings(args: argparse.Namespace) -> Settings:
+    from hand_pose_ros.evaluation.bag_evaluation import Settings
+
+    given = {'depth_topic': args.depth_topic, 'camera_info_topic': args.camera_info_topic,
+             'intrinsics': args.intrinsics and tuple(args.intrinsics), 'depth_scale': args.depth_scale}
+    estimator = {'side': args.side, 'cube_side': args.cube_size, 'min_score': args.min_score}
+    return Settings(args.model, args.device, ground_truth=args.ground_truth,
+                    bag={key: value for key, value in given.items() if value is not None},
+                    estimator={key: value for key, value in estimator.items() if value is not None})
+
+
+def _names(bags: Sequence[str]) -> dict[str, str]:
+    """A short name for each bag, which no other has."""
+    stems = [Path(bag).stem for bag in bags]
+    return {bag: stem if stems.count(stem) == 1 else '_'.join(Path(bag).with_suffix('').parts).strip('/\\_.')
+            for bag, stem in zip(bags, stems, strict=True)}
+
+
+def _deliver(args: argparse.Namespace, result: Result, others: Sequence[Result],
+             read_depths: Callable[[Sequence[int]], dict[int, Any]] | None) -> None:
+    """Print the numbers, and write the files that were asked for."""
+    for note in result.notes:
+        print(f'NOTE: {note}', file=sys.stderr)
+    summary = result.summary()
+    print_summaries([(result.name, summary), *((other.name, other.summary()) for other in others)])
+    if args.json:
+        write_json(summary, args.json)
+    if args.out:
+        result.save(args.out)
+    if args.report:
+        from hand_pose_ros.evaluation.report import write_report
+        if any(other.skeleton != result.skeleton for other in others):
+            raise InputError(f'--compare: all results must have the joints of {result.skeleton.name}')
+        print(f'report: {write_report([result, *others], args.report, read_depths)}')
+
+
+def print_summaries(summaries: Iterable[tuple[str, dict[str, Any]]]) -> None:
+    """Print accuracy as one table, and for each result what needs no truth."""
+    summaries = list(summaries)
+    rows = [row for name, summary in summaries if 'mean_mm' in summary for row in accuracy_rows(name, summary)]
+    if rows:
+        print(text_table(('mm, % of frames', *ACCURACY_COLUMNS), rows))
+    for name, summary in summaries:
+        if 'latency_ms' not in summary:
+            continue
+        print(f'{name}: {summary["frames_total"]} frames, {number(summary["detection_rate"], 1, " %", 100)} with a '
+              f'hand, {summary["frames_per_s"]} frames/s, jitter {number(summary["jitter_mm"], 2, " mm")}, '
+              f'bone drift {number(summary["bone_drift_mm"], 2, " mm")}')
+        keys = ('mean', 'p50', 'p90', 'p99', 'max')
+        print(text_table(('ms', *keys), [(stage, *(number(row.get(key), 3) for key in keys))
+                                         for stage, row in summary['latency_ms'].items()]))
+
+
+def _progress(unit: str) -> Callable[[Iterable[Any], int], Iterable[Any]]:
+    return lambda items, total: tqdm(items, total=total, unit=f' {unit}', disable=None)  # a terminal only

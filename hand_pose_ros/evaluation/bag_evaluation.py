@@ -1,0 +1,224 @@
+"""The estimator over every depth image of a bag, in order and as fast as it goes; over many bags, on all cores."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from itertools import islice
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hand_pose_ros.bags import BagWriter, DepthBag, Frame
+from hand_pose_ros.errors import HandPoseError, InputError
+from hand_pose_ros.estimator import HandEstimate, HandPoseEstimator
+from hand_pose_ros.evaluation.ground_truth import read_truth
+from hand_pose_ros.evaluation.results import Result
+from hand_pose_ros.geometry import Intrinsics
+
+Progress = Callable[[Iterable[Any], int], Iterable[Any]]
+"""Passes items on and shows how far it is; the number is how many there will be."""
+
+STAGES = ('decode', 'detect', 'crop', 'predict', 'refine', 'uncrop')
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How bags are evaluated.
+
+    Attributes:
+        model, device: as in HandPoseEstimator.from_pretrained.
+        num_threads: of the network on the CPU; None chooses.
+        estimator: further arguments of HandPoseEstimator.
+        bag: arguments of DepthBag beside the path.
+        ground_truth: a file or a topic, see `ground_truth.read_truth`.
+    """
+
+    model: str | None = None
+    device: str = 'auto'
+    num_threads: int | None = None
+    estimator: Mapping[str, Any] = field(default_factory=dict)
+    bag: Mapping[str, Any] = field(default_factory=dict)
+    ground_truth: str | None = None
+
+
+def evaluate_bag(path: str | Path, settings: Settings, progress: Progress | None = None,
+                 hands_bag: str | Path | None = None) -> Result:
+    """Estimate every depth image of a bag; on the CPU twice the same to the last bit.
+
+    Of several hands in an image the first one counts, which is the one that has been tracked longest. An image that
+    cannot be decoded counts as one without a hand. Where the bag is damaged, what was before it is evaluated. The
+    notes of the result tell both.
+
+    Args:
+        progress: wraps the frames.
+        hands_bag: write /hand/joints and /hand/skeleton there, with the stamps of the images, to be played beside the
+            original.
+
+    Raises:
+        InputError: the bag, the truth or the camera cannot be used, or there is not one image to decode.
+        CheckpointError: there are no such weights.
+    """
+    estimator = HandPoseEstimator.from_pretrained(
+        settings.model, device=settings.device, num_threads=settings.num_threads, **settings.estimator)
+    record = _Record(estimator)
+    notes: list[str] = []
+    start = time.perf_counter()
+    with ExitStack() as stack:
+        bag = stack.enter_context(DepthBag(path, **settings.bag))
+        writer = stack.enter_context(BagWriter(hands_bag)) if hands_bag is not None else None
+        frames: Iterable[Frame] = _until_damaged(bag, notes)
+        for frame in progress(frames, len(bag)) if progress else frames:
+            hands = record.add(frame)
+            if writer:
+                if len(record.stamps) == 1:
+                    writer.write_skeleton(frame.stamp_ns, frame.frame_id, estimator.skeleton,
+                                          str(settings.model or 'default'), estimator.metadata.get('version', ''))
+                writer.write_hands(frame.stamp_ns, frame.frame_id, hands, estimator.skeleton)
+    rate = len(record.stamps) / (time.perf_counter() - start)
+    if record.intrinsics is None:
+        raise InputError(f'{path}: there is no depth image to evaluate'
+                         + (f' ({record.failures[0]})' if record.failures else ''))
+    damaged = bool(notes)
+    if record.failures:
+        notes.append(f'{len(record.failures)} of {len(record.stamps)} images could not be used and count as images '
+                     f'without a hand; the first: {record.failures[0]}')
+    result = Result(
+        name=Path(path).stem, skeleton=estimator.skeleton, intrinsics=record.intrinsics,
+        predictions=np.stack(record.joints), stamps_ns=np.array(record.stamps), notes=tuple(notes),
+        seconds={stage: np.array(record.seconds[stage]) for stage in sorted(record.seconds, key=_stage_order)},
+        info={'bag': str(path), 'depth_topic': bag.depth_topic, 'model': str(settings.model or 'default'),
+              'device': settings.device, 'frames_per_s': round(rate, 1), 'damaged': damaged})
+    if settings.ground_truth is None:
+        return result
+    truth, note = read_truth(settings.ground_truth, path, result)
+    return replace(result, truth=truth, notes=(*notes, *note),
+                   info={**result.info, 'ground_truth': settings.ground_truth})
+
+
+def evaluate_bags(paths: Sequence[str | Path], settings: Settings, jobs: int | None = None,
+                  progress: Progress | None = None,
+                  hands_bags: Mapping[str | Path, str | Path] | None = None
+                  ) -> dict[str | Path, Result | HandPoseError]:
+    """Evaluate many bags at once; one that fails does not stop the others.
+
+    Where torchrun has started several processes, on one or more machines, each takes its share of the bags, and the
+    first gets all results; the others get none.
+
+    Args:
+        jobs: bags at the same time on this machine; None takes one per core.
+        progress: wraps the finished bags.
+        hands_bags: where to write the hands of each bag, see `evaluate_bag`.
+
+    Returns:
+        For each path the result, or what went wrong.
+    """
+    world, rank = int(os.environ.get('WORLD_SIZE', 1)), int(os.environ.get('RANK', 0))
+    here = int(os.environ.get('LOCAL_WORLD_SIZE', 1))
+    mine = paths[rank::world]
+    cores = max(1, _cores() // here)
+    workers = max(1, min(jobs or cores, len(mine)))
+    settings = replace(settings, num_threads=settings.num_threads or max(1, cores // workers))
+    done: dict[str | Path, Result | HandPoseError] = {}
+    with ProcessPoolExecutor(workers, mp_context=get_context('spawn')) as pool:
+        futures = {pool.submit(_attempt, path, settings, (hands_bags or {}).get(path)): path for path in mine}
+        finished = as_completed(futures)
+        for future in progress(finished, len(futures)) if progress else finished:
+            try:
+                done[futures[future]] = future.result()
+            except Exception as error:  # the process itself died: out of memory, say
+                done[futures[future]] = HandPoseError(f'{futures[future]}: the process that read it died ({error})')
+    if world > 1:
+        done = _gather(done, rank, world)
+    return {path: done[path] for path in paths if path in done}
+
+
+def read_depths(path: str | Path, rows: Sequence[int], settings: Settings) -> dict[int, NDArray[np.float32]]:
+    """The depth images (H, W) in metres of some rows of a result, as far as they can be decoded."""
+    depths = {}
+    with DepthBag(path, **settings.bag) as bag:
+        for row, frame in enumerate(islice(bag, max(rows, default=-1) + 1)):
+            if row in rows:
+                depths[row] = frame.depth
+    return depths
+
+
+class _Record:
+    """What came out of each image, in order."""
+
+    def __init__(self, estimator: HandPoseEstimator) -> None:
+        self._estimator = estimator
+        self.stamps: list[int] = []
+        self.joints: list[NDArray[np.float64]] = []
+        self.seconds: dict[str, list[float]] = {}
+        self.failures: list[str] = []
+        self.intrinsics: Intrinsics | None = None
+
+    def add(self, frame: Frame) -> list[HandEstimate]:
+        """Decode an image, estimate its hands, and keep them and the time it took."""
+        hands: list[HandEstimate] = []
+        times: dict[str, float] = {}
+        try:
+            begin = time.perf_counter()
+            depth, intrinsics = frame.depth, frame.intrinsics
+            decoded = time.perf_counter()
+            hands = self._estimator(depth, intrinsics)
+            end = time.perf_counter()
+            times = {'decode': decoded - begin, **self._estimator.timings, 'total': end - begin}
+            self.intrinsics = self.intrinsics or intrinsics
+        except InputError as error:
+            self.failures.append(f'image {len(self.stamps) + 1}: {error}')
+        for stage in times.keys() | self.seconds.keys():
+            self.seconds.setdefault(stage, [np.nan] * len(self.stamps)).append(times.get(stage, np.nan))
+        self.stamps.append(frame.stamp_ns)
+        self.joints.append(hands[0].joints.astype(np.float64) if hands
+                           else np.full((len(self._estimator.skeleton), 3), np.nan))
+        return hands
+
+
+def _until_damaged(frames: Iterable[Frame], notes: list[str]) -> Iterator[Frame]:
+    """The frames, ending where the bag is damaged, with a note of it; before the first frame it is an error."""
+    frame = None
+    try:
+        for frame in frames:
+            yield frame
+    except InputError as error:
+        if frame is None:
+            raise
+        notes.append(f'{error}; only the images before the damage are evaluated.')
+
+
+def _attempt(path: str | Path, settings: Settings, hands_bag: str | Path | None) -> Result | HandPoseError:
+    try:
+        return evaluate_bag(path, settings, hands_bag=hands_bag)
+    except HandPoseError as error:
+        return error
+
+
+def _gather(done: dict[str | Path, Any], rank: int, world: int) -> dict[str | Path, Any]:
+    """Everybody's results at the first process; none elsewhere."""
+    import torch.distributed as dist
+
+    dist.init_process_group('gloo')
+    try:
+        everything: list[dict[str | Path, Any]] | None = [{}] * world if rank == 0 else None
+        dist.gather_object(done, everything)
+    finally:
+        dist.destroy_process_group()
+    return {path: result for share in everything or [] for path, result in share.items()}
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count() or 1
+
+
+def _stage_order(stage: str) -> int:
+    """Stages in the order of the path, the total last."""
+    return STAGES.index(stage) if stage in STAGES else len(STAGES)

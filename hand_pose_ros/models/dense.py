@@ -110,7 +110,8 @@ class HandDense(nn.Module):
         directions = maps[:, :3 * self.joints].unflatten(1, (self.joints, 3))
         closeness = maps[:, 3 * self.joints:]
         positions, seen = cells(patch.float())
-        joints, agreement = decode(positions, seen, directions, closeness)
+        with torch.autocast(patch.device.type, enabled=False):  # nor may training in half precision halve them
+            joints, agreement = decode(positions, seen, directions, closeness)
         summary = self.summary(torch.cat([features[3].mean(dim=(2, 3)), agreement.to(x.dtype)], dim=1))
         return {
             'joints': joints, 'confidence': summary[:, :self.joints],

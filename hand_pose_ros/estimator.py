@@ -183,7 +183,7 @@ class HandPoseEstimator:
         center = reading.joints.mean(axis=0)
         if np.linalg.norm(center - cube.center) > RECENTER_M and center[2] > self.near:
             again = self._predict(depth, intrinsics, Cube(tuple(center.tolist()), cube.side), track)
-            if again.score >= reading.score:
+            if again.confidence.mean() >= reading.confidence.mean():
                 return again
         return reading
 
@@ -194,20 +194,28 @@ class HandPoseEstimator:
             as_right, as_left = self.side != 'left', self.side != 'right'
             patches = np.stack([patch] * as_right + [patch[..., ::-1]] * as_left)
         with self._timed('predict'):
-            answer = self.engine.run(patches)
+            answer = self.engine.run_full(patches)
         with self._timed('uncrop'):
-            readings = []
-            for coordinates, shown in zip(answer, patches, strict=True):
-                confidence, score = explain(shown, coordinates, cube.side, self.skeleton)
-                readings.append((coordinates.astype(np.float64), confidence, score))
-            rightness = readings[0][2] - readings[-1][2]
-            best = 0
-            if as_right and as_left and track.rightness + rightness < 0:
-                best = 1
-            coordinates, confidence, score = readings[best]
-            if not as_right or best == 1:
-                coordinates = coordinates * (-1, 1, 1)
-            return _Reading(cube, cube.from_cube(coordinates), confidence, score, rightness)
+            confidence, score, right = self._judge(patches, answer, cube)
+            rightness = float(right[0] - right[-1])
+            shown = 1 if as_right and as_left and track.rightness + rightness < 0 else 0
+            coordinates = answer['joints'][shown].astype(np.float64)
+            if shown == 1 or not as_right:
+                coordinates[:, 0] *= -1
+            return _Reading(cube, cube.from_cube(coordinates), confidence[shown], float(score[shown]), rightness)
+
+    def _judge(self, patches: NDArray[np.float32], answer: dict[str, NDArray[np.float32]], cube: Cube,
+               ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Confidence of the joints (N, J), score (N,), and how far each looks like a right hand (N,), of N patches.
+
+        A network that has learned to judge itself is believed; of another, the joints are held against the depth.
+        """
+        if 'confidence' in answer:
+            return _sigmoid(answer['confidence']), _sigmoid(answer['hand']), answer['side']
+        judged = [explain(patch, joints, cube.side, self.skeleton)
+                  for patch, joints in zip(patches, answer['joints'], strict=True)]
+        score = np.array([score for _, score in judged], np.float32)
+        return np.stack([confidence for confidence, _ in judged]), score, score
 
     def _follow(self, track: _Track, reading: _Reading) -> HandEstimate:
         track.rightness = SIDE_MEMORY * track.rightness + reading.rightness
@@ -222,6 +230,10 @@ class HandPoseEstimator:
         start = time.perf_counter()
         yield
         self.timings[stage] += time.perf_counter() - start
+
+
+def _sigmoid(logits: NDArray[np.float32]) -> NDArray[np.float32]:
+    return 0.5 * (1 + np.tanh(0.5 * logits))
 
 
 def _overlaps(cube: Cube, hands: list[HandEstimate]) -> bool:

@@ -1,4 +1,4 @@
-"""A right hand with a forearm: shape and pose in, skin and joints out."""
+"""A right hand with a forearm: shape and pose in, skin and joints out. Frame and angles: see `kinematics`."""
 
 from __future__ import annotations
 
@@ -32,30 +32,35 @@ def _template() -> tuple[Tensor, ...]:
                             number(shape.wrist), number(shape.forearm))
     vertices, faces, weights, part = surface.build(rest)
     return (torch.from_numpy(vertices).float(), torch.from_numpy(faces), torch.from_numpy(weights).float(),
-            torch.from_numpy(part), rotations[0], origins[0], bone_sizes(shape)[0])
+            torch.from_numpy(part), rotations[0], origins[0], bone_sizes(shape)[0], rest_pose())
 
 
-class HandModel(nn.Module):
-    """Skin and joints of right hands (linear blend skinning over bones and half-turning joints).
-
-    Hand frame: see `hand_pose_ros.synthetic.kinematics`. The skin is one closed mesh, its triangles counter-clockwise
-    seen from outside; it includes the forearm, which turns about the wrist while the hand stays.
+class SkinnedHand(nn.Module):
+    """Skin and joints of right hands: linear blend skinning over the bones of `kinematics.BONES`.
 
     Attributes:
-        faces: (F, 3) int64 vertices of each triangle.
+        faces: (F, 3) int64 vertices of each triangle, counter-clockwise seen from outside.
         vertex_part: (V,) int64, 0-4 thumb to little finger, 5 palm, 6 forearm.
+
+    Args:
+        vertices: (V, 3) skin at rest, in metres in the hand frame.
+        faces: see above.
+        weights: (V, K) share of each bone in each vertex, rows adding to 1.
+        part: (V,) see `vertex_part`.
+        rotations, origins, sizes: (K, 3, 3), (K, 3), (K, 3) of the bones at rest (`kinematics.forward`, `bone_sizes`).
+        rest: (P,) pose at rest, from which the joints between bones turn half-way.
     """
 
     faces: Tensor
     vertex_part: Tensor
     rest: Tensor
 
-    def __init__(self) -> None:
+    def __init__(self, vertices: Tensor, faces: Tensor, weights: Tensor, part: Tensor, rotations: Tensor,
+                 origins: Tensor, sizes: Tensor, rest: Tensor) -> None:
         super().__init__()
-        vertices, faces, weights, part, rotations, origins, sizes = _template()
         self.register_buffer('faces', faces.clone())
         self.register_buffer('vertex_part', part.clone())
-        self.register_buffer('rest', rest_pose())
+        self.register_buffer('rest', rest.clone())
         self.register_buffer('_to_bone', rotations.mT / sizes[..., None])  # rest position -> bone, in bone sizes
         self.register_buffer('_origins', origins.clone())
         ones = torch.cat([vertices, torch.ones(len(vertices), 1)], 1)
@@ -69,3 +74,10 @@ class HandModel(nn.Module):
         shift = origins - (linear @ self._origins[..., None])[..., 0]
         transforms = torch.cat([linear, shift[..., None]], -1).transpose(2, 3).reshape(len(pose), -1, 3)  # (B, 4K, 3)
         return torch.matmul(self._basis, transforms), joints
+
+
+class HandModel(SkinnedHand):
+    """The parametric hand: one closed skin with a forearm, which turns about the wrist while the hand stays."""
+
+    def __init__(self) -> None:
+        super().__init__(*_template())

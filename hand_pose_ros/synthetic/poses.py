@@ -20,9 +20,9 @@ __all__ = ['LIMITS', 'POSE', 'PROTOTYPES', 'sample_poses']
 _FINGER_LIMITS = {'mcp_flexion': (-25, 92), 'pip_flexion': (-6, 108), 'dip_flexion': (-10, 75)}
 _LIMITS = {
     'wrist_flexion': (-65, 65), 'wrist_deviation': (-32, 22), 'ring_cmc_flexion': (0, 12), 'pinky_cmc_flexion': (0, 22),
-    'thumb_cmc_radial': (-5, 65), 'thumb_cmc_palmar': (-5, 62), 'thumb_cmc_roll': (35, 120), 'thumb_mcp_flexion': (-15, 60),
-    'thumb_mcp_abduction': (-12, 18), 'thumb_ip_flexion': (-25, 80), 'index_mcp_abduction': (-14, 26),
-    'middle_mcp_abduction': (-14, 14), 'ring_mcp_abduction': (-14, 22), 'pinky_mcp_abduction': (-16, 40)}
+    'thumb_cmc_radial': (-5, 70), 'thumb_cmc_palmar': (-5, 62), 'thumb_cmc_roll': (35, 120), 'thumb_mcp_flexion': (-15, 60),
+    'thumb_mcp_abduction': (-12, 18), 'thumb_ip_flexion': (-25, 80), 'index_mcp_abduction': (-14, 28),
+    'middle_mcp_abduction': (-14, 14), 'ring_mcp_abduction': (-14, 25), 'pinky_mcp_abduction': (-16, 44)}
 LIMITS = torch.deg2rad(torch.tensor([_LIMITS.get(n) or _FINGER_LIMITS[n.split('_', 1)[1]] for n in POSE],
                                     dtype=torch.float32))
 """(P, 2) least and greatest angle, radians."""
@@ -31,11 +31,11 @@ LIMITS = torch.deg2rad(torch.tensor([_LIMITS.get(n) or _FINGER_LIMITS[n.split('_
 _CURL = {'S': (2, 4), 'O': (-14, 0), 'R': (22, 30), 'H': (42, 55), 'C': (28, 42), 'G': (55, 72), 'F': (80, 98),
          'K': (4, 88), 'B': (76, 8), 'P': (52, 46), 'T': (66, 74)}
 # Degrees of abduction of index, middle, ring and little finger.
-_SPREAD = {'together': (-3, 0, -3, -6), 'apart': (5, 0, 4, 8), 'wide': (19, 0, 15, 29), 'vee': (14, -9, -2, -3),
+_SPREAD = {'together': (-3, 0, -3, -6), 'apart': (5, 0, 4, 8), 'wide': (20, 0, 18, 36), 'vee': (14, -9, -2, -3),
            'vulcan': (-4, 9, 13, 8), 'horns': (8, 0, 0, 22)}
 # Degrees: CMC radial, palmar, roll; MCP flexion, abduction; IP flexion.
 _THUMB = {
-    'out': (54, 12, 62, -6, 6, -12), 'up': (46, 22, 66, -10, 2, -12), 'side': (12, 14, 62, 4, -4, 4),
+    'out': (58, 12, 62, -8, 6, -16), 'up': (48, 22, 66, -10, 2, -14), 'side': (12, 14, 62, 4, -4, 4),
     'rest': (32, 26, 74, 10, 0, 14), 'cup': (34, 44, 88, 10, 0, 16), 'wrap': (22, 52, 100, 26, 0, 26),
     'across': (20, 47, 98, 34, 0, 48), 'tucked': (6, 34, 92, 46, 0, 34), 'key': (14, 30, 78, 16, -2, 34),
     'index': (20, 43, 98, 16, 0, 18), 'middle': (15, 50, 102, 19, 2, 16), 'ring': (11, 56, 108, 24, 5, 17),
@@ -110,7 +110,7 @@ def _anything(rng: Random) -> Tensor:
     split = 0.35 * (rng.uniform(1, low=-1) + rng.uniform(4, low=-0.5, high=0.5))  # more in the knuckles, or beyond
     pose[:, _MCP] = (close + split).clamp(-0.25, 1) * high[_MCP]
     pose[:, _PIP] = (close - split).clamp(-0.05, 1) * high[_PIP]
-    spread = rng.uniform(1, low=-0.8, high=1.1) * pose.new_tensor([19, 0, 15, 29]) + rng.normal(4, std=5)
+    spread = rng.uniform(1, low=-0.8, high=1.1) * pose.new_tensor([20, 0, 18, 36]) + rng.normal(4, std=5)
     pose[:, _ABDUCTION] = torch.deg2rad(spread) * (1 - pose[:, _MCP].clamp(0) / high[_MCP])
     return pose
 

@@ -17,12 +17,16 @@ from hand_pose_ros.synthetic.rng import Random
 MEN, WOMEN = (0.183, 0.084), (0.166, 0.075)
 """Mean hand length and breadth in metres."""
 
+FINGER_END = 0.92
+"""How far a finger goes on past its tip joint, over the half thickness of its last bone: the joint is the centre of
+the pulp, about one fingertip radius inside the end."""
+
 # Bones along each digit over hand length, to the end of the finger. Thumb: metacarpal, proximal, distal.
 _SEGMENTS = ((0.251, 0.196, 0.158), (0.251, 0.138, 0.112), (0.272, 0.163, 0.119), (0.253, 0.156, 0.117), (0.198, 0.117, 0.104))
 # Where the digits begin: x over hand breadth, y over hand length, z over hand breadth (the arch of the palm).
 _ROOTS = ((0.215, 0.105, 0.13), (0.252, 0.447, 0.02), (0.0, 0.446, 0.0), (-0.220, 0.422, 0.015), (-0.415, 0.382, 0.06))
 # Half thickness of the flesh over half the breadth.
-_RADII = ((0.400, 0.232, 0.216), (0.231, 0.196, 0.176), (0.228, 0.199, 0.180), (0.212, 0.186, 0.169), (0.191, 0.166, 0.152))
+_RADII = ((0.400, 0.234, 0.222), (0.231, 0.196, 0.176), (0.228, 0.199, 0.180), (0.212, 0.186, 0.169), (0.191, 0.166, 0.152))
 
 
 @dataclass(frozen=True)
@@ -64,8 +68,7 @@ class Shape:
 
 
 def _finger_end(radii: Tensor) -> Tensor:
-    # The tip joint is the centre of the fingertip's pulp: one fingertip radius inside the end.
-    return 0.92 * radii[:, :, 2]
+    return FINGER_END * radii[:, :, 2]
 
 
 def make_shape(length: Tensor, breadth: Tensor, bone_scale: Tensor | None = None, root_scale: Tensor | None = None,
@@ -91,7 +94,7 @@ def make_shape(length: Tensor, breadth: Tensor, bone_scale: Tensor | None = None
     segments = torch.cat([segments[..., :2], (segments[..., 2] - _finger_end(radii))[..., None]], -1)
     return Shape(length, breadth, roots, segments, radii,
                  palm_depth=0.165 * breadth * girth[:, 0],
-                 wrist=torch.stack([0.345 * breadth, 0.24 * breadth], -1) * girth[:, 1:2],
+                 wrist=torch.stack([0.335 * breadth, 0.235 * breadth], -1) * girth[:, 1:2],
                  forearm=torch.stack([1.50 * length * girth[:, 2], 0.52 * breadth * girth[:, 3]], -1))
 
 

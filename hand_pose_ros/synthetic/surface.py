@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hand_pose_ros.synthetic.shapes import FINGER_END
+
 Array = NDArray[np.float64]
 
 
@@ -79,7 +81,7 @@ def _finger(rest: RestHand, p: Array, digit: int) -> Array:
     """Distance to the phalanges of a digit (0 = thumb)."""
     bones = [7 + 6 * digit + i for i in (1, 3, 5)]
     lengths, radii = rest.segments[digit], rest.radii[digit]
-    tip = 0.92 * radii[2]
+    tip = FINGER_END * radii[2]
     first = 1 if digit == 0 else 0
     d = np.full(len(p), np.inf)
     for i in range(first, 3):
@@ -90,7 +92,7 @@ def _finger(rest: RestHand, p: Array, digit: int) -> Array:
             belly = _pad(q, (0, 0.50 * length, 0.28 * r), (0.92 * r, 0.46 * length, 0.86 * r))
             part = _blend(part, belly, 0.3 * r)
         else:
-            part = _roll(q, (0, 0, 0), (0, length, 0.0), 0.97 * r, 0.80 * tip, 0.90)
+            part = _roll(q, (0, 0, 0), (0, length, 0.0), 0.97 * r, 0.88 * tip, 0.90)
             pulp = _pad(q, (0, 0.72 * length, 0.16 * r), (1.0 * tip, length * 0.28 + tip, 0.90 * tip))
             part = _blend(part, pulp, 0.5 * r)
         d = _blend(d, part, 0.45 * r) if np.isfinite(d).all() else part
@@ -107,10 +109,10 @@ def _palm(rest: RestHand, p: Array) -> Array:
         q = rest.local(p, 2 + i)
         reach = np.linalg.norm(roots[i] - rest.origins[2 + i])
         size = (1.0, 1.0, 0.96, 0.88)[i - 1]
-        part = _roll(q, (0, -0.004, 0.001), (0, reach, 0.001), 0.80 * depth * size, 0.78 * depth * size)
+        part = _roll(q, (0, -0.004, 0.001), (0, reach, 0.001), 0.78 * depth * size, 0.84 * depth * size)
         flesh = _roll(q, (0, 0, 0.40 * depth), (0, reach - 0.006, 0.24 * depth), 0.72 * depth * size, 0.76 * depth * size)
         part = _blend(part, flesh, 0.5 * depth)
-        d = _blend(d, part, 0.012) if i > 1 else part
+        d = _blend(d, part, 0.010) if i > 1 else part
     # Pads at the roots of the fingers, and the webs between them.
     for i in range(1, 5):
         bone = 7 + 6 * i + 1
@@ -123,18 +125,18 @@ def _palm(rest: RestHand, p: Array) -> Array:
         root = (roots[i] + roots[i + 1]) / 2 + np.array([0, 0.002, 0.003])
         d = _blend(d, _sheet(p, at[0], at[1], root, 0.52 * rest.radii[i + 1, 0]), 0.009)
     # Heel of the hand: carpus, hypothenar.
-    d = _blend(d, _pad(p, (0.005, 0.012, 0.004), (0.34 * b, 0.032, 0.88 * depth)), 0.014)
-    hypothenar = _roll(p, (-0.21 * b, 0.09 * length, 0.10 * b), (-0.345 * b, 0.29 * length, 0.105 * b), 0.155 * b, 0.125 * b)
-    return _blend(d, hypothenar, 0.014)
+    d = _blend(d, _pad(p, (0.003, 0.014, 0.002), (0.30 * b, 0.030, 1.0 * depth)), 0.010)
+    hypothenar = _roll(p, (-0.20 * b, 0.12 * length, 0.09 * b), (-0.335 * b, 0.29 * length, 0.10 * b), 0.115 * b, 0.13 * b)
+    return _blend(d, hypothenar, 0.012)
 
 
 def _thumb_root(rest: RestHand, p: Array) -> tuple[Array, Array]:
     """Distances to the thenar eminence and to the web between thumb and index finger."""
     q, length, b = rest.local(p, 8), rest.segments[0, 0], rest.breadth
     r = rest.radii[0, 1]
-    bone = _roll(q, (0, 0, 0), (0, length, 0), 1.15 * r, 1.10 * r)
-    muscle = _roll(q, (0.002, 0.10 * length, 0.004), (0.0, 0.78 * length, 0.003), 0.185 * b, 0.13 * b)
-    ball = _roll(p, (0.10 * b, 0.10 * rest.length, 0.13 * b), tuple(rest.origins[9] * 0.72), 0.155 * b, 0.135 * b)
+    bone = _roll(q, (0, 0, 0), (0, length, 0), 1.05 * r, 1.10 * r)
+    muscle = _roll(q, (0.002, 0.22 * length, 0.004), (0.0, 0.78 * length, 0.003), 0.165 * b, 0.13 * b)
+    ball = _roll(p, (0.10 * b, 0.12 * rest.length, 0.12 * b), tuple(rest.origins[9] * 0.72), 0.12 * b, 0.145 * b)
     thenar = _blend(_blend(bone, muscle, 0.008), ball, 0.012)
     index = rest.origins[13]
     sheet = _sheet(p, rest.origins[7], rest.origins[9] + rest.rotations[8] @ np.array([0, 0.002, 0]),
@@ -146,9 +148,9 @@ def _forearm(rest: RestHand, p: Array) -> Array:
     """Distance to wrist and forearm: an oval that widens to a round, cut at the elbow."""
     q = rest.local(p, 0)
     t = np.clip(-q[:, 1] / rest.forearm[0], -0.2, 1)
-    grow = np.clip(t / 0.62, 0, 1)
+    grow = np.clip(t / 0.72, 0, 1)
     grow = grow * grow * (3 - 2 * grow)
-    flare = 0.06 * np.exp(-((t - 0.02) / 0.09) ** 2)  # the heads of radius and ulna
+    flare = 0.03 * np.exp(-((t - 0.02) / 0.09) ** 2)  # the heads of radius and ulna
     rx = rest.wrist[0] * (1 + flare) + (rest.forearm[1] - rest.wrist[0]) * grow
     rz = rest.wrist[1] * (1 + flare) + (0.86 * rest.forearm[1] - rest.wrist[1]) * grow
     x, z = q[:, 0] / rx, (q[:, 2] - 0.002) / rz
@@ -164,27 +166,26 @@ def _blend_max(a: Array, b: Array, width: float) -> Array:
 
 def distance(rest: RestHand, p: Array) -> Array:
     """Signed distance (approximate, exact in sign) of points (N, 3) to the skin, negative inside."""
-    d = _blend(_palm(rest, p), _forearm(rest, p), 0.024)
+    d = _blend(_palm(rest, p), _forearm(rest, p), 0.014)
     thenar, web = _thumb_root(rest, p)
-    d = _blend(_blend(d, thenar, 0.014), web, 0.014)
+    d = _blend(_blend(d, thenar, 0.012), web, 0.014)
     d = _blend(d, _finger(rest, p, 0), 0.006)
     for digit in range(1, 5):
         d = _blend(d, _finger(rest, p, digit), 0.005)
-    return d
+    return d - 0.0003  # flat triangles lie inside a round surface by about as much
 
 
 # Reading off the surface -------------------------------------------------------------------------------------------
 
 def _lattice(rest: RestHand, step: float) -> Array:
-    """Lattice points (nx, ny, nz, 3), about `step` apart in the hand, wider towards the elbow."""
-    top = rest.length + 0.02
-    ys = [top]
-    while ys[-1] > -rest.forearm[0] - 0.02:
-        ys.append(ys[-1] - step * np.interp(-ys[-1], [0.0, 0.08, 0.2], [1.0, 2.4, 3.2]))
+    """Lattice points (nx, ny, nz, 3), about `step` apart across the hand, wider along it and towards the elbow."""
+    ys = [rest.length + 0.02]
+    while ys[-1] > -rest.forearm[0] - 0.05:
+        ys.append(ys[-1] - step * np.interp(-ys[-1], [-0.02, 0.08, 0.2], [1.35, 4.0, 6.0]))
     y = np.array(ys[::-1])
     x = np.arange(-0.095, 0.135, step)
     z = np.arange(-0.034, 0.080, step)
-    grow = np.interp(-y, [0.0, 0.10, 0.25], [1.0, 1.6, 2.0])[None, :, None]
+    grow = np.interp(-y, [-0.01, 0.08, 0.20], [1.0, 1.8, 2.6])[None, :, None]
     grid = np.stack(np.meshgrid(x, y, z, indexing='ij'), -1)
     grid[..., 0] *= grow
     grid[..., 2] *= grow
@@ -240,14 +241,18 @@ def _gradient(rest: RestHand, p: Array, h: float = 2e-4) -> Array:
     return np.stack([(distance(rest, p + e) - distance(rest, p - e)) / (2 * h) for e in np.eye(3) * h], -1)
 
 
+def _neighbour_mean(values: Array, quads: NDArray[np.int64]) -> Array:
+    """(V, ...) for each vertex the mean of `values` over its neighbours."""
+    total = np.zeros_like(values)
+    for i in range(4):
+        np.add.at(total, quads[:, i], values[quads[:, (i + 1) % 4]])
+    return total / np.bincount(quads.reshape(-1), minlength=len(values))[:, None]
+
+
 def _fair(rest: RestHand, vertices: Array, quads: NDArray[np.int64]) -> Array:
     """Even out the vertices along the surface and put them exactly on it."""
-    ends = np.concatenate([np.stack([quads[:, i], quads[:, (i + 1) % 4]], 1) for i in range(4)])
     for relax in (0.6, 0.6, 0.0):
-        mean = np.zeros_like(vertices)
-        np.add.at(mean, ends[:, 0], vertices[ends[:, 1]])
-        mean /= np.bincount(ends[:, 0], minlength=len(vertices))[:, None]
-        vertices = vertices + relax * (mean - vertices)
+        vertices = vertices + relax * (_neighbour_mean(vertices, quads) - vertices)
         for _ in range(2):
             g = _gradient(rest, vertices)
             d = distance(rest, vertices)
@@ -296,7 +301,7 @@ def _weights(rest: RestHand, p: Array) -> tuple[Array, NDArray[np.int64]]:
     q = rest.local(p, 8)
     thumbness = _ramp(d_palm - thumb, -0.010, 0.014) * _ramp(q[:, 1], -0.020, 0.016)
 
-    wrist = _share(rest.local(p, 0)[:, 1], 0.020, 0.020)
+    wrist = _share(rest.local(p, 0)[:, 1], 0.022, 0.026)
     hand = wrist[2]
     w[:, 0], w[:, 1] = wrist[0], wrist[1]
     for digit in range(5):
@@ -326,7 +331,7 @@ def _weights(rest: RestHand, p: Array) -> tuple[Array, NDArray[np.int64]]:
     return w / w.sum(1, keepdims=True), part
 
 
-def build(rest: RestHand, step: float = 0.0056) -> tuple[Array, NDArray[np.int64], Array, NDArray[np.int64]]:
+def build(rest: RestHand, step: float = 0.0047) -> tuple[Array, NDArray[np.int64], Array, NDArray[np.int64]]:
     """The skin of the hand at rest.
 
     Returns:
@@ -338,4 +343,6 @@ def build(rest: RestHand, step: float = 0.0056) -> tuple[Array, NDArray[np.int64
     vertices, quads = _surface_nets(grid, value)
     vertices = _fair(rest, vertices, quads)
     weights, part = _weights(rest, vertices)
+    for _ in range(2):
+        weights = 0.5 * (weights + _neighbour_mean(weights, quads))
     return vertices, _triangles(vertices, quads), weights, part

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from dataclasses import dataclass, field
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from hand_pose_ros.models import build
 from hand_pose_ros.skeleton import get_skeleton
 
 WEIGHTS = Path(__file__).resolve().parents[1] / 'weights'
+DEFAULT = 'hand_dense'
 
 
 @dataclass(frozen=True)
@@ -69,13 +71,13 @@ def save_checkpoint(path: str | Path, network: nn.Module, metadata: dict[str, An
         temporary.unlink(missing_ok=True)
 
 
-def load_checkpoint(name_or_path: str | Path) -> Checkpoint:
-    """A checkpoint that ships, by name, or any other, by path.
+def load_checkpoint(name_or_path: str | PathLike[str] | None = None) -> Checkpoint:
+    """A checkpoint that ships, by name (None: the default), or any other, by path.
 
     Raises:
         CheckpointError: unknown name; missing, damaged or foreign file; weights that do not fit the network.
     """
-    path = _locate(name_or_path)
+    path = _locate(DEFAULT if name_or_path is None else name_or_path)
     metadata, tensors = _read(path)
     network = _restore(path, 'network', metadata, tensors)
     refiner = _restore(path, 'refiner', metadata['refiner'], tensors) if 'refiner' in metadata else None
@@ -101,7 +103,7 @@ def _tensors(part: str, network: nn.Module, half: bool) -> dict[str, Tensor]:
             for name, tensor in network.state_dict().items()}
 
 
-def _locate(name_or_path: str | Path) -> Path:
+def _locate(name_or_path: str | PathLike[str]) -> Path:
     name = str(name_or_path)
     if name in (shipped := available()):
         return shipped[name]

@@ -1,0 +1,65 @@
+"""Ways to run a network fast, behind one call: `make_engine(network).run(patches)`."""
+
+from __future__ import annotations
+
+import copy
+import logging
+import os
+
+import torch
+from torch import nn
+
+from hand_pose_ros.errors import HandPoseError
+from hand_pose_ros.runtime.engine import Engine, Pipeline, TorchEngine
+from hand_pose_ros.runtime.onnx_engine import OnnxEngine
+
+__all__ = ['Engine', 'default_threads', 'make_engine']
+
+_log = logging.getLogger(__name__)
+
+
+def default_threads() -> int:
+    """Threads for one network on this machine: at most 4, more do not help networks this small; the rest is ROS's."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count() or 1
+    return min(4, cores if cores <= 2 else cores - 1)
+
+
+def make_engine(network: nn.Module, device: str = 'auto', num_threads: int | None = None,
+                refiner: nn.Module | None = None) -> Engine:
+    """The fastest engine for a network (and the refiner of its joints) on a device.
+
+    The modules given are left as they are.
+
+    Args:
+        device: 'cpu', 'cuda', 'cuda:N', any other device of PyTorch, or 'auto': a CUDA GPU if there is one, else the
+            CPU. ONNX Runtime runs the network on a CPU, CUDA graphs (in half precision) on a GPU, PyTorch elsewhere.
+        num_threads: on the CPU; None takes `default_threads()`.
+
+    Raises:
+        HandPoseError: the device does not exist here, or `num_threads` is below 1.
+    """
+    if num_threads is not None and num_threads < 1:
+        raise HandPoseError(f'num_threads is {num_threads}, but a network needs at least one')
+    why = f"device '{device}' was asked for"
+    if device == 'auto':
+        device, why = ('cuda', 'a GPU was found') if torch.cuda.is_available() else ('cpu', 'no GPU was found')
+    pipeline = Pipeline(copy.deepcopy(network), copy.deepcopy(refiner)).requires_grad_(False).eval().cpu()
+    engine: Engine
+    if device == 'cpu':
+        threads = num_threads or default_threads()
+        engine = OnnxEngine(pipeline, threads)
+        why += f'; {threads} threads'
+    elif device.startswith('cuda'):
+        if not torch.cuda.is_available():
+            raise HandPoseError(f"device '{device}' was asked for, but PyTorch {torch.__version__} finds no GPU: "
+                                "use 'cpu' or 'auto', or install a PyTorch for CUDA and its driver")
+        from hand_pose_ros.runtime.cuda_engine import CudaEngine
+        engine = CudaEngine(pipeline, device)
+    else:
+        try:
+            engine = TorchEngine(pipeline, device)
+        except (RuntimeError, AssertionError) as error:  # either, depending on what the device lacks
+            raise HandPoseError(f"device '{device}' cannot be used here ({str(error).splitlines()[0]}): "
+                                "use 'auto', 'cpu' or 'cuda'") from error
+    _log.info('runs on %s (%s)', engine.name, why)
+    return engine

@@ -1,0 +1,74 @@
+"""CUDA graphs: the whole network, with its copies, as one launch, in half precision."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hand_pose_ros.geometry import PATCH_SIZE
+from hand_pose_ros.runtime.engine import Array, Engine, Pipeline
+
+WARM_UP = 3
+"""Runs before the capture: libraries choose algorithms and allocate in the first ones, which a graph must not hold."""
+
+
+@dataclass(frozen=True)
+class _Captured:
+    graph: torch.cuda.CUDAGraph
+    patches: Tensor
+    """Pinned (N, 1, 128, 128), where the graph reads from."""
+    answer: tuple[Tensor, ...]
+    """Pinned, where the graph writes to."""
+
+
+class CudaEngine(Engine):
+    """One CUDA graph for each batch size that is a power of two, captured when first needed.
+
+    Other sizes run in the next larger graph. Input and output lie in pinned host memory, and the copies are part of
+    the graph, so that a call is one launch and one wait.
+    """
+
+    name = 'cuda graph'
+
+    def __init__(self, pipeline: Pipeline, device: str = 'cuda') -> None:
+        self.outputs, self.device = pipeline.outputs, torch.device(device)
+        self.pipeline = pipeline.to(self.device).half()
+        self.stream = torch.cuda.Stream(self.device)
+        self.captured: dict[int, _Captured] = {}
+        self._captured_for(1)  # the first image shall not wait
+
+    def _run(self, patches: Array) -> list[Array]:
+        count = len(patches)
+        captured = self._captured_for(count)
+        captured.patches[:count].copy_(torch.from_numpy(np.ascontiguousarray(patches)))
+        with torch.cuda.stream(self.stream):
+            captured.graph.replay()
+        self.stream.synchronize()
+        # Copies, for the next replay writes to the same memory.
+        return [tensor[:count].numpy().copy() for tensor in captured.answer]
+
+    def _captured_for(self, count: int) -> _Captured:
+        size = 1 << max(count - 1, 0).bit_length()
+        if size not in self.captured:
+            self.captured[size] = self._capture(size)
+        return self.captured[size]
+
+    def _capture(self, size: int) -> _Captured:
+        source = torch.ones(size, 1, PATCH_SIZE, PATCH_SIZE, pin_memory=True)
+        with torch.inference_mode(), torch.cuda.device(self.device):
+            with torch.cuda.stream(self.stream):
+                for _ in range(WARM_UP):
+                    answer = self._compute(source)
+                targets = tuple(torch.empty(tensor.shape, pin_memory=True) for tensor in answer)
+            self.stream.synchronize()
+            graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(graph, stream=self.stream):
+                for target, tensor in zip(targets, self._compute(source), strict=True):
+                    target.copy_(tensor, non_blocking=True)
+        return _Captured(graph, source, targets)
+
+    def _compute(self, source: Tensor) -> tuple[Tensor, ...]:
+        return self.pipeline(source.to(self.device, non_blocking=True).half())

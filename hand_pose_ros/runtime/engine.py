@@ -1,0 +1,77 @@
+"""What every engine is: patches in, named arrays out. And the plain one, which the others are held to."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from hand_pose_ros.errors import InputError
+from hand_pose_ros.geometry import PATCH_SIZE
+
+Array = NDArray[np.float32]
+
+
+class Pipeline(nn.Module):
+    """A network and what refines its joints as one module that gives a tuple of tensors, named by `outputs`."""
+
+    def __init__(self, network: nn.Module, refiner: nn.Module | None = None) -> None:
+        super().__init__()
+        self.network, self.refiner = network, refiner
+        self.outputs: tuple[str, ...] = getattr(network, 'outputs', ('joints',))
+
+    def forward(self, patches: Tensor) -> tuple[Tensor, ...]:
+        full = getattr(self.network, 'forward_full', None)
+        answer: dict[str, Tensor] = {'joints': self.network(patches)} if full is None else full(patches)
+        if self.refiner is not None:
+            answer['joints'] = self.refiner(patches, answer['joints'])
+        return tuple(answer[name].float() for name in self.outputs)
+
+
+class Engine(ABC):
+    """Runs one network, and its refiner if it has one.
+
+    Attributes:
+        name: of the engine.
+        outputs: names of what `run_full` returns.
+    """
+
+    name: str
+    outputs: tuple[str, ...]
+
+    def run(self, patches: Array) -> Array:
+        """Patches (B, 1, 128, 128) float32 in [-1, 1] -> joints (B, J, 3) float32 in cube units.
+
+        Raises:
+            InputError: the patches have another shape or type.
+        """
+        return self.run_full(patches)['joints']
+
+    def run_full(self, patches: Array) -> dict[str, Array]:
+        """As `run`, with everything else that the network says, by name (for hand_dense: `HandDense.forward_full`)."""
+        if patches.shape[1:] != (1, PATCH_SIZE, PATCH_SIZE) or patches.dtype != np.float32:
+            raise InputError(f'patches must be (B, 1, {PATCH_SIZE}, {PATCH_SIZE}) float32, '
+                             f'not {patches.shape} {patches.dtype}')
+        return dict(zip(self.outputs, self._run(patches), strict=True))
+
+    @abstractmethod
+    def _run(self, patches: Array) -> list[Array]:
+        """Checked patches -> arrays in the order of `outputs`, which the caller may keep."""
+
+
+class TorchEngine(Engine):
+    """Plain PyTorch, float32, one call after the other."""
+
+    name = 'pytorch'
+
+    def __init__(self, pipeline: Pipeline, device: str = 'cpu') -> None:
+        self.outputs, self.device = pipeline.outputs, torch.device(device)
+        self.pipeline = pipeline.to(self.device)
+
+    def _run(self, patches: Array) -> list[Array]:
+        with torch.inference_mode():
+            answer = self.pipeline(torch.from_numpy(np.ascontiguousarray(patches)).to(self.device))
+            return [tensor.cpu().numpy() for tensor in answer]

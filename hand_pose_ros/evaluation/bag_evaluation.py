@@ -26,7 +26,7 @@ from hand_pose_ros.geometry import Intrinsics
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 """Passes items on and shows how far it is; the number is how many there will be."""
 
-STAGES = ('decode', 'detect', 'crop', 'predict', 'refine', 'uncrop')
+STAGES = ('read', 'decode', 'detect', 'crop', 'predict', 'refine', 'uncrop')
 
 
 @dataclass(frozen=True)
@@ -74,9 +74,9 @@ def evaluate_bag(path: str | Path, settings: Settings, progress: Progress | None
     with ExitStack() as stack:
         bag = stack.enter_context(DepthBag(path, **settings.bag))
         writer = stack.enter_context(BagWriter(hands_bag)) if hands_bag is not None else None
-        frames: Iterable[Frame] = _until_damaged(bag, notes)
-        for frame in progress(frames, len(bag)) if progress else frames:
-            hands = record.add(frame)
+        frames: Iterable[tuple[Frame, float]] = _until_damaged(bag, notes)
+        for frame, read in progress(frames, len(bag)) if progress else frames:
+            hands = record.add(frame, read)
             if writer:
                 if len(record.stamps) == 1:
                     writer.write_skeleton(frame.stamp_ns, frame.frame_id, estimator.skeleton,
@@ -161,8 +161,8 @@ class _Record:
         self.failures: list[str] = []
         self.intrinsics: Intrinsics | None = None
 
-    def add(self, frame: Frame) -> list[HandEstimate]:
-        """Decode an image, estimate its hands, and keep them and the time it took."""
+    def add(self, frame: Frame, read: float) -> list[HandEstimate]:
+        """Decode an image, estimate its hands, and keep them and the time it took; `read` [s] it took before."""
         hands: list[HandEstimate] = []
         times: dict[str, float] = {}
         try:
@@ -171,7 +171,7 @@ class _Record:
             decoded = time.perf_counter()
             hands = self._estimator(depth, intrinsics)
             end = time.perf_counter()
-            times = {'decode': decoded - begin, **self._estimator.timings, 'total': end - begin}
+            times = {'read': read, 'decode': decoded - begin, **self._estimator.timings, 'total': read + end - begin}
             self.intrinsics = self.intrinsics or intrinsics
         except InputError as error:
             self.failures.append(f'image {len(self.stamps) + 1}: {error}')
@@ -183,12 +183,17 @@ class _Record:
         return hands
 
 
-def _until_damaged(frames: Iterable[Frame], notes: list[str]) -> Iterator[Frame]:
-    """The frames, ending where the bag is damaged, with a note of it; before the first frame it is an error."""
+def _until_damaged(frames: Iterable[Frame], notes: list[str]) -> Iterator[tuple[Frame, float]]:
+    """The frames and how many seconds each took to be read.
+
+    They end where the bag is damaged, with a note of it; before the first frame that is an error.
+    """
     frame = None
+    start = time.perf_counter()
     try:
         for frame in frames:
-            yield frame
+            yield frame, time.perf_counter() - start
+            start = time.perf_counter()
     except InputError as error:
         if frame is None:
             raise

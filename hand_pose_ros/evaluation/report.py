@@ -121,14 +121,15 @@ def _cards(result: Result, read_depths: ReadDepths | None) -> list[_Card]:
         center = np.nanmean(known, axis=0)
         cube = Cube((float(center[0]), float(center[1]), float(center[2])), _VIEW_SIDE_M)
         depth = depths.get(row)
-        picture = ''
+        picture, kind = '', 'blind'
         if depth is not None:
             panels = [close_up(depth, result.intrinsics, _Hand(joints.astype(np.float32), cube), result.skeleton)
                       for joints in (estimate, truth) if np.isfinite(joints).all()]
+            kind = '' if len(panels) == 2 else 'single'
             picture = _data_image('png', cv2.imencode('.png', np.hstack(panels))[1].tobytes(),
                                   'joints on the depth image: estimate' + (', truth' if len(panels) > 1 else ''))
         cards.append(_Card(
-            f'<div class="frame{"" if picture else " blind"}"><h3>{escape(title)}</h3>{picture}'
+            f'<div class="frame {kind}"><h3>{escape(title)}</h3>{picture}'
             f'<canvas data-view="{len(cards)}" aria-label="3D view"></canvas></div>',
             {'estimate': _millimetres(estimate, cube), 'truth': _millimetres(truth, cube),
              'cloud': _cloud(depth, result.intrinsics, cube) if depth is not None else []}))
@@ -188,7 +189,7 @@ def _tiles(summary: dict[str, Any]) -> str:
         ('frames within 40 mm', number(within.get('40'), 1, ' %', 100)),
         ('area under the curve', number(summary.get('auc_0_80'), 3)),
         ('hands found', number(summary['detection_rate'], 1, ' %', 100)),
-        ('frames per second', number(1000 / latency['mean'] if latency else None, 0)),
+        ('frames per second', number(summary.get('frames_per_s'), 0)),
         ('latency, 99th percentile', number(latency.get('p99'), 1, ' ms')),
         ('jitter', number(summary.get('error_jitter_mm', summary.get('jitter_mm')), 1, ' mm')),
     ]

@@ -51,6 +51,8 @@ class Bag:
         self._reader, self._interrupted = _open(self.path)
         self.connections: list[Connection] = list(self._reader.connections)
         self.is_ros1 = not self._reader.is2
+        self.typestore: Typestore = self._reader.typestore
+        self.start_ns: int = self._reader.start_time
 
     def messages(self, connections: Collection[Connection],
                  start: int | None = None) -> Iterator[tuple[Connection, int, bytes]]:

@@ -1,0 +1,262 @@
+"""`hand-pose estimate`: the joints of every depth image of a bag or a folder, as numbers, as a bag and as pictures."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from hand_pose_ros.bags import BagWriter, DepthBag
+from hand_pose_ros.depth import read_png
+from hand_pose_ros.drawing import overlay
+from hand_pose_ros.errors import HandPoseError, InputError
+from hand_pose_ros.geometry import Intrinsics
+from hand_pose_ros.skeleton import Skeleton
+
+if TYPE_CHECKING:
+    from hand_pose_ros.estimator import HandEstimate, HandPoseEstimator
+
+_EXAMPLES = """examples:
+  hand-pose estimate recording.mcap --out joints.npz --overlay pictures
+  hand-pose estimate old.bag --depth-topic /camera/depth/image_raw --out joints.mcap
+  hand-pose estimate frames/ --intrinsics 363.9 363.9 255.4 206.3 --overlay pictures
+  hand-pose estimate sr305.png --intrinsics 476.0 476.0 313.7 242.8 --depth-scale 0.000125 --out joints.npz
+
+The .npz has a row for each hand: frame (which image), joints (J,3) in metres, confidence (J), score, side, id,
+cube_center, cube_side; and once: names and stamp_ns of the images, joint_names, skeleton. The .mcap has the topics
+/hand/joints and /hand/skeleton, and /hand/markers where ROS is installed. PNGs, which have no time, count as 30 Hz.
+"""
+_PNG_PERIOD_NS = 33_333_333
+
+
+def add_parser(subparsers: Any) -> None:
+    """Declare the verb."""
+    parser = subparsers.add_parser(
+        'estimate', help='joints and pictures from a bag or from 16-bit depth PNGs', description=__doc__.split(': ')[1],
+        epilog=_EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('input', metavar='INPUT', type=Path, help='a bag (ROS 1, sqlite3, MCAP), a 16-bit depth PNG, '
+                        'or a folder of them')
+    parser.add_argument('--intrinsics', nargs=4, type=float, metavar=('FX', 'FY', 'CX', 'CY'),
+                        help='of the camera in pixels; needed for PNGs and for bags without camera_info')
+    parser.add_argument('--depth-scale', type=float, default=0.001, metavar='M', help='metres per depth unit (0.001)')
+    parser.add_argument('--depth-topic', metavar='TOPIC', help='which of several depth topics of a bag')
+    parser.add_argument('--camera-info-topic', metavar='TOPIC', help='if not camera_info beside the depth topic')
+    parser.add_argument('--model', help='name of weights that ship, or a checkpoint (the default weights)')
+    parser.add_argument('--device', default='auto', help='auto, cpu, cuda or cuda:N (auto)')
+    parser.add_argument('--side', default='auto', choices=('auto', 'left', 'right'), help='which hand it is (auto)')
+    parser.add_argument('--cube-size', type=float, metavar='M', help='side of the cube around a hand, metres')
+    parser.add_argument('--max-hands', type=int, default=1, metavar='N', help='at most N hands per image (1)')
+    parser.add_argument('--out', type=Path, metavar='FILE', help='.npz or .mcap')
+    parser.add_argument('--overlay', type=Path, metavar='FOLDER', help='a picture of every image with its joints')
+    parser.set_defaults(parser=parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Estimate, write what was asked for, and sum up; 1 if any image could not be used."""
+    if args.out and args.out.suffix not in ('.npz', '.mcap'):
+        args.parser.error(f'--out {args.out}: the name must end in .npz or .mcap')
+    with ExitStack() as stack:
+        images, count = _open(args, stack)
+        from hand_pose_ros.estimator import HandPoseEstimator  # imports torch: not for --help and bad arguments
+        options = {} if args.cube_size is None else {'cube_side': args.cube_size}
+        estimator = HandPoseEstimator.from_pretrained(
+            args.model, device=args.device, side=args.side, max_hands=args.max_hands, **options)
+        sinks: list[_Sink] = []
+        if args.overlay:
+            sinks.append(_Overlays(args.overlay, estimator.skeleton))
+        if args.out and args.out.suffix == '.npz':
+            sinks.append(_Arrays(args.out, estimator.skeleton))
+        elif args.out:
+            writer = stack.enter_context(BagWriter(args.out))
+            sinks.append(_HandBag(writer, estimator.skeleton, estimator.metadata))
+        return estimate(images, count, estimator, sinks)
+
+
+@dataclass(frozen=True)
+class DepthInput:
+    """One image to work on; `load` gives its depth (H, W) in metres and its intrinsics, or raises InputError."""
+
+    name: str
+    stamp_ns: int
+    frame_id: str
+    load: Callable[[], tuple[NDArray[np.float32], Intrinsics]]
+
+
+class _Sink(Protocol):
+    """Somewhere results go."""
+
+    def add(self, image: DepthInput, depth: NDArray[np.float32], intrinsics: Intrinsics,
+            hands: Sequence[HandEstimate]) -> None: ...
+
+    def finish(self) -> None: ...
+
+
+def estimate(images: Iterator[DepthInput], count: int, estimator: HandPoseEstimator, sinks: Sequence[_Sink]) -> int:
+    """Run the estimator over all images and feed the sinks; an image that cannot be used is reported and left out."""
+    done = found = failed = 0
+    seconds: list[float] = []
+    for image in tqdm(images, total=count, unit='image', disable=None):
+        try:
+            depth, intrinsics = image.load()
+            start = time.perf_counter()
+            hands = estimator(depth, intrinsics)
+            seconds.append(time.perf_counter() - start)
+        except InputError as error:
+            failed += 1
+            tqdm.write(f'hand-pose estimate: {error}', file=sys.stderr)
+            continue
+        done += 1
+        found += bool(hands)
+        for sink in sinks:
+            sink.add(image, depth, intrinsics, hands)
+    if not done:
+        raise InputError('none of the images could be used, so nothing was written')
+    for sink in sinks:
+        sink.finish()
+    print(f'{done} images, {found} with a hand, {failed} that could not be used; '
+          f'{1000 * float(np.median(seconds)):.1f} ms for the median image')
+    return 1 if failed else 0
+
+
+def _open(args: argparse.Namespace, stack: ExitStack) -> tuple[Iterator[DepthInput], int]:
+    """The images of the input, and how many there are."""
+    is_png = args.input.suffix.lower() == '.png'
+    paths = [args.input] if is_png else sorted(args.input.glob('*.png'), key=_natural) if args.input.is_dir() else []
+    if paths:
+        if args.intrinsics is None:
+            args.parser.error('PNGs come without a camera: give --intrinsics FX FY CX CY')
+        return _from_pngs(paths, args.intrinsics, args.depth_scale), len(paths)
+    bag = stack.enter_context(DepthBag(
+        args.input, args.depth_topic, args.camera_info_topic, args.intrinsics, args.depth_scale))
+    return _from_bag(bag), len(bag)
+
+
+def _from_pngs(paths: Sequence[Path], intrinsics: Sequence[float], depth_scale: float) -> Iterator[DepthInput]:
+    fx, fy, cx, cy = intrinsics
+
+    def load(path: Path) -> tuple[NDArray[np.float32], Intrinsics]:
+        depth = read_png(path, depth_scale)
+        return depth, Intrinsics(fx, fy, cx, cy, width=depth.shape[1], height=depth.shape[0])
+
+    for i, path in enumerate(paths):
+        yield DepthInput(path.stem, i * _PNG_PERIOD_NS, 'camera', lambda path=path: load(path))  # type: ignore[misc]
+
+
+def _from_bag(bag: DepthBag) -> Iterator[DepthInput]:
+    i = 0
+    try:
+        for i, frame in enumerate(bag, start=1):
+            yield DepthInput(f'{i - 1:06d}', frame.stamp_ns, frame.frame_id,
+                             lambda frame=frame: (frame.depth, frame.intrinsics))  # type: ignore[misc]
+    except InputError as error:
+        # The damage of a bag is one more image that cannot be used; what came before it counts.
+        def fail(error: InputError = error) -> tuple[NDArray[np.float32], Intrinsics]:
+            raise error
+        yield DepthInput(f'{i:06d}', 0, '', fail)
+
+
+def _natural(path: Path) -> list[Any]:
+    """Sorts 30.png before 110.png."""
+    return [int(part) if part.isdigit() else part for part in re.split(r'(\d+)', path.name)]
+
+
+class _Overlays:
+    """A picture of each image."""
+
+    def __init__(self, folder: Path, skeleton: Skeleton) -> None:
+        self._folder, self._skeleton = folder, skeleton
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def add(self, image: DepthInput, depth: NDArray[np.float32], intrinsics: Intrinsics,
+            hands: Sequence[HandEstimate]) -> None:
+        path = self._folder / f'{image.name}.png'
+        if not cv2.imwrite(str(path), overlay(depth, intrinsics, hands, self._skeleton)):
+            raise HandPoseError(f'{path}: the picture cannot be written: choose another --overlay folder')
+
+    def finish(self) -> None:
+        pass
+
+
+class _Arrays:
+    """One .npz with everything."""
+
+    def __init__(self, path: Path, skeleton: Skeleton) -> None:
+        self._path, self._skeleton = path, skeleton
+        self._images: list[DepthInput] = []
+        self._hands: list[tuple[int, HandEstimate]] = []
+
+    def add(self, image: DepthInput, depth: NDArray[np.float32], intrinsics: Intrinsics,
+            hands: Sequence[HandEstimate]) -> None:
+        self._hands += [(len(self._images), hand) for hand in hands]
+        self._images.append(image)
+
+    def finish(self) -> None:
+        hands, joints = [hand for _, hand in self._hands], len(self._skeleton)
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        part = self._path.with_name(f'.{self._path.name}.part')
+        with part.open('wb') as file:
+            np.savez_compressed(
+                file,
+                names=np.array([image.name for image in self._images]),
+                stamp_ns=np.array([image.stamp_ns for image in self._images], np.int64),
+                frame=np.array([frame for frame, _ in self._hands], np.int64),
+                joints=np.array([hand.joints for hand in hands], np.float32).reshape(-1, joints, 3),
+                confidence=np.array([hand.confidence for hand in hands], np.float32).reshape(-1, joints),
+                score=np.array([hand.score for hand in hands], np.float32),
+                side=np.array([hand.side for hand in hands], 'U7'),
+                id=np.array([hand.id for hand in hands], 'U32'),
+                cube_center=np.array([hand.cube.center for hand in hands], np.float32).reshape(-1, 3),
+                cube_side=np.array([hand.cube.side for hand in hands], np.float32),
+                joint_names=np.array(self._skeleton.joint_names),
+                skeleton=np.array(self._skeleton.name))
+        os.replace(part, self._path)
+
+
+class _HandBag:
+    """An MCAP file with the messages that the node would publish."""
+
+    def __init__(self, writer: BagWriter, skeleton: Skeleton, metadata: dict[str, Any]) -> None:
+        self._writer, self._skeleton, self._metadata = writer, skeleton, metadata
+        self._begun = False
+        try:
+            from hand_pose_ros.ros.markers import HandMarkers
+            self._markers: Any = HandMarkers(skeleton)
+        except HandPoseError:  # no ROS, no markers; the joints need none
+            self._markers = None
+
+    def add(self, image: DepthInput, depth: NDArray[np.float32], intrinsics: Intrinsics,
+            hands: Sequence[HandEstimate]) -> None:
+        if not self._begun:
+            about = self._metadata
+            self._writer.write_skeleton(image.stamp_ns, image.frame_id, self._skeleton,
+                                        str(about.get('name', about['architecture'])), str(about['version']))
+            self._begun = True
+        self._writer.write_hands(image.stamp_ns, image.frame_id, hands, self._skeleton)
+        if self._markers is not None:
+            self._writer.write_serialized('/hand/markers', 'visualization_msgs/msg/MarkerArray',
+                                          self._serialized_markers(image, hands), image.stamp_ns)
+
+    def finish(self) -> None:
+        pass
+
+    def _serialized_markers(self, image: DepthInput, hands: Sequence[HandEstimate]) -> bytes:
+        from builtin_interfaces.msg import Time
+        from rclpy.serialization import serialize_message
+        from std_msgs.msg import Header
+
+        from hand_pose_ros.ros.conversions import hands_to_msg
+        sec, nanosec = divmod(image.stamp_ns, 1_000_000_000)
+        header = Header(stamp=Time(sec=sec, nanosec=nanosec), frame_id=image.frame_id)
+        return serialize_message(self._markers.update(hands_to_msg(header, hands, self._skeleton), lifetime_s=0.0))

@@ -1,0 +1,78 @@
+"""`hand-pose replay`: publish a bag of any kind on ROS topics, with its recorded types and stamps."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+_EXAMPLES = """examples:
+  hand-pose replay recording.mcap
+  hand-pose replay old_ros1.bag --rate 0.5 --loop
+  hand-pose replay recording.mcap --clock --start 12.5 --topics /depth/image_rect /depth/camera_info
+  hand-pose replay recording.mcap --ros-args -r /camera/depth/image_rect_raw:=/depth/image_rect \\
+                                             -r /camera/depth/camera_info:=/depth/camera_info
+
+While it plays, pause and go on with
+  ros2 service call /replay/pause std_srvs/srv/SetBool "{data: true}"     (or false)
+"""
+
+
+def add_parser(subparsers: Any) -> None:
+    """Declare the verb."""
+    parser = subparsers.add_parser(
+        'replay', help='publish a bag on ROS topics', epilog=_EXAMPLES,
+        description='Publish a bag (ROS 1, sqlite3, MCAP) on ROS 2 topics, with its recorded types and stamps.',
+        formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('bag', metavar='BAG', type=Path, help='a .bag, .mcap or .db3 file, or a ROS 2 folder')
+    parser.add_argument('--topics', nargs='+', metavar='TOPIC', help='publish these only')
+    parser.add_argument('--rate', type=float, default=1.0, metavar='X', help='times the recorded speed (1)')
+    parser.add_argument('--loop', action='store_true', help='begin again at the end, until Ctrl-C')
+    parser.add_argument('--start', type=float, default=0.0, metavar='S', help='begin S seconds into the bag (0)')
+    parser.add_argument('--start-paused', action='store_true', help='wait for the service /replay/pause')
+    parser.add_argument('--clock', action='store_true', help='publish /clock, for nodes with use_sim_time')
+    parser.add_argument('--qos', default='recorded', choices=('recorded', 'reliable', 'best_effort'),
+                        help='reliability of the publishers (recorded; for ROS 1 bags that is reliable)')
+    parser.add_argument('--wait', type=float, default=2.0, metavar='S',
+                        help='wait up to S seconds for a subscriber before the first message (2)')
+    parser.add_argument('--ros-args', nargs=argparse.REMAINDER, default=[], metavar='...',
+                        help='remappings (-r from:=to) and so on, as with ros2 run')
+    parser.set_defaults(parser=parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Play until the end of the bag, or with --loop until Ctrl-C; 0 when everything was published.
+
+    Raises:
+        HandPoseError: there is no ROS, or the bag cannot be read.
+    """
+    if not args.rate > 0:
+        args.parser.error(f'--rate {args.rate}: must be more than 0')
+    if args.start < 0:
+        args.parser.error(f'--start {args.start}: must not be negative')
+    from hand_pose_ros.bags import Bag
+    from hand_pose_ros.ros.replay import Replay  # says what is missing where there is no ROS
+    import rclpy  # isort: skip
+    from rclpy.signals import SignalHandlerOptions  # isort: skip
+
+    # Without handlers of rclpy, Ctrl-C arrives here, between two messages, as a KeyboardInterrupt.
+    rclpy.init(args=['--ros-args', *args.ros_args], signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        with Bag(args.bag) as bag:
+            replay = Replay(bag, topics=args.topics, rate=args.rate, reliability=args.qos, clock=args.clock,
+                            paused=args.start_paused)
+            try:
+                replay.wait_for_subscribers(args.wait)
+                replay.play(args.start)
+                while args.loop:
+                    replay.play(args.start)
+            except KeyboardInterrupt:
+                pass  # how a loop ends
+            finally:
+                for topic, count in sorted(replay.published.items()):
+                    print(f'{count:7d}  {topic}')
+                print(f'the latest message was {1000 * replay.lateness_s:.0f} ms late')
+                replay.close()
+    finally:
+        rclpy.try_shutdown()
+    return 0

@@ -1,0 +1,180 @@
+"""Publishes a bag on ROS topics as it was recorded: types, stamps, order and pace."""
+
+from __future__ import annotations
+
+import importlib
+import time
+from collections.abc import Collection
+from typing import Any
+
+import rclpy
+from rclpy.duration import Duration
+from rclpy.exceptions import InvalidTopicNameException
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
+from rosbags.convert.converter import migrate_bytes
+from rosbags.interfaces import Connection, ConnectionExtRosbag2, QosDurability, QosReliability
+from rosgraph_msgs.msg import Clock
+from std_srvs.srv import SetBool
+
+from hand_pose_ros.bags import Bag
+from hand_pose_ros.bags.bag import typestore
+from hand_pose_ros.errors import InputError
+
+CLOCK_PERIOD_S = 0.025
+SETTLE_S = 0.5
+_RENAMED = {'tf/msg/tfMessage': 'tf2_msgs/msg/TFMessage'}  # on the way from ROS 1 to ROS 2
+
+
+class Replay:
+    """Node `replay`: one publisher for each topic of a bag, and the service `~/pause` (std_srvs/SetBool).
+
+    Serialized messages of ROS 2 bags are passed on as they are; those of ROS 1 bags are converted. Topics whose type
+    is not installed are left out with a warning.
+
+    Args:
+        bag: open for reading.
+        topics: publish these only; None takes all.
+        rate: how many times faster than recorded.
+        reliability: 'recorded', 'reliable' or 'best_effort'; what ROS 1 recorded counts as reliable.
+        clock: publish /clock with the time of recording, for nodes that use_sim_time.
+        paused: wait for the service before the first message.
+
+    Raises:
+        InputError: one of the topics cannot be published, or none can.
+    """
+
+    def __init__(self, bag: Bag, *, topics: Collection[str] | None = None, rate: float = 1.0,
+                 reliability: str = 'recorded', clock: bool = False, paused: bool = False) -> None:
+        self._bag, self._rate, self._paused = bag, rate, paused
+        self.published: dict[str, int] = {}
+        """Number of messages on each topic."""
+        self.lateness_s = 0.0
+        """Of the message that was published latest after its time."""
+        self.node = rclpy.create_node('replay')
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self.node)
+        self._clock = self.node.create_publisher(Clock, '/clock', 10) if clock else None
+        self._outputs: dict[str, Publisher] = {}
+        self._connections: list[Connection] = []
+        self._cache: dict[str, object] = {}  # of the conversion from ROS 1
+        for connection in bag.connections:
+            if connection.msgcount and (topics is None or connection.topic in topics):
+                self._add(connection, reliability)
+        if missing := set(topics or ()) - set(self._outputs):
+            raise InputError(f'{bag.path}: cannot publish {", ".join(sorted(missing))}: choose from '
+                             f'{", ".join(sorted({c.topic for c in bag.connections}))}')
+        if not self._outputs:
+            raise InputError(f'{bag.path}: there is nothing to publish: no topic has messages of an installed type')
+        self.node.create_service(SetBool, '~/pause', self._on_pause)
+
+    def wait_for_subscribers(self, timeout_s: float) -> None:
+        """Wait until somebody listens and nobody new has come for a moment, but no longer than the timeout."""
+        start = changed = time.monotonic()
+        before: list[int] = []
+        while time.monotonic() - start < timeout_s:
+            now = [output.get_subscription_count() for output in self._outputs.values()]
+            if now != before:
+                before, changed = now, time.monotonic()
+            # The other side needs a moment, too, before it hears what is best effort.
+            if any(now) and time.monotonic() - changed > SETTLE_S:
+                return
+            self._executor.spin_once(timeout_sec=0.05)
+
+    def play(self, start_s: float = 0.0) -> None:
+        """Publish the bag once, from `start_s` seconds after its beginning.
+
+        Raises:
+            InputError: where the bag is damaged, after everything before the damage; or nothing was recorded so late.
+        """
+        messages = self._bag.messages(self._connections, start=self._bag.start_ns + round(start_s * 1e9))
+        first_ns = -1
+        for connection, recorded_ns, data in messages:
+            message = self._to_ros2(connection, data)
+            if first_ns < 0:
+                first_ns, self._origin = recorded_ns, time.monotonic()
+            self._wait_for(recorded_ns, first_ns)
+            self._outputs[connection.topic].publish(message)
+            self.published[connection.topic] += 1
+        if first_ns < 0:
+            raise InputError(f'{self._bag.path}: nothing was recorded later than {start_s} s: give a smaller start')
+        for output in self._outputs.values():
+            output.wait_for_all_acked(Duration(seconds=1))
+
+    def close(self) -> None:
+        """Take the node and its topics off the graph."""
+        self._executor.shutdown()
+        self.node.destroy_node()
+
+    def _add(self, connection: Connection, reliability: str) -> None:
+        msgtype = _RENAMED.get(connection.msgtype, connection.msgtype)
+        if self._clock is not None and connection.topic == '/clock':
+            return
+        try:
+            package, _, name = msgtype.split('/')
+            cls = getattr(importlib.import_module(f'{package}.msg'), name)
+            if self._bag.is_ros1 and msgtype not in typestore().fielddefs:
+                raise ImportError(f'{msgtype} cannot be converted from ROS 1')
+            if connection.topic not in self._outputs:
+                self._outputs[connection.topic] = self.node.create_publisher(
+                    cls, connection.topic, _quality(connection, reliability))
+                self.published[connection.topic] = 0
+        except (ImportError, AttributeError, ValueError, InvalidTopicNameException) as error:
+            self.node.get_logger().warning(f'{connection.topic} is left out: {error}')
+            return
+        self._connections.append(connection)
+
+    def _to_ros2(self, connection: Connection, data: bytes) -> bytes:
+        """The message as ROS 2 serializes it."""
+        if not self._bag.is_ros1:
+            return bytes(data)
+        try:
+            return bytes(migrate_bytes(
+                self._bag.typestore, typestore(), connection.msgtype,
+                _RENAMED.get(connection.msgtype, connection.msgtype), self._cache, data, src_is2=False, dst_is2=True))
+        except Exception as error:  # whatever random bytes provoke
+            raise InputError(f'{self._bag.path}: a message on {connection.topic} is damaged ({error}): record or '
+                             'copy the bag again') from error
+
+    def _wait_for(self, recorded_ns: int, first_ns: int) -> None:
+        """Serve the pause, keep /clock running, and return when a message is due."""
+        while True:
+            if self._paused:
+                stopped = time.monotonic()
+                while self._paused:
+                    self._executor.spin_once(timeout_sec=0.1)
+                self._origin += time.monotonic() - stopped
+            left = self._origin + (recorded_ns - first_ns) / 1e9 / self._rate - time.monotonic()
+            if self._clock is not None:
+                now_ns = min(recorded_ns, recorded_ns - round(left * self._rate * 1e9))
+                clock = Clock()
+                clock.clock.sec, clock.clock.nanosec = divmod(now_ns, 1_000_000_000)
+                self._clock.publish(clock)
+            self._executor.spin_once(timeout_sec=min(max(left, 0.0), CLOCK_PERIOD_S))
+            if left <= 0:
+                self.lateness_s = max(self.lateness_s, -left)
+                return
+
+    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        self._paused = request.data
+        response.success, response.message = True, 'paused' if request.data else 'playing'
+        return response
+
+
+def _quality(connection: Connection, reliability: str) -> QoSProfile:
+    """What the publisher of a topic offers: as recorded, unless a reliability is asked for."""
+    ext: Any = connection.ext
+    profile = QoSProfile(depth=10, reliability=QoSReliabilityPolicy.RELIABLE)
+    if isinstance(ext, ConnectionExtRosbag2):
+        recorded = ext.offered_qos_profiles
+        latched = any(qos.durability == QosDurability.TRANSIENT_LOCAL for qos in recorded)
+        if any(qos.reliability == QosReliability.BEST_EFFORT for qos in recorded):
+            profile.reliability = QoSReliabilityPolicy.BEST_EFFORT
+    else:
+        latched = bool(ext.latching)
+    if latched:
+        profile.durability = QoSDurabilityPolicy.TRANSIENT_LOCAL
+    if reliability != 'recorded':
+        profile.reliability = getattr(QoSReliabilityPolicy, reliability.upper())
+    return profile

@@ -36,7 +36,7 @@ _COARSE, _COARSE_SIDE = 64, 0.64  # pixels and metres across the image in which 
 _NEAREST = 24  # of its pixels (1 cm2 each) make the first guess: an object of finger-to-hand size
 _NEGATIVES = 0.05  # share of samples without a hand
 _SECOND_HAND = 0.08
-_SECOND_BLOCK = 4
+_SECOND_BLOCK = 8
 
 # Behind its surface lies a joint that can be seen: at most about its flesh (m, for a hand of 0.175 m).
 _FLESH = torch.tensor([0.034] + [0.034, 0.024, 0.016, 0.015] + [0.026, 0.017, 0.015, 0.014] * 4)
@@ -100,7 +100,7 @@ class SyntheticHands:
     """
 
     def __init__(self, split: str = 'train', *, seed_base: int = 0, device: str | torch.device = 'cpu',
-                 sensors: Sequence[str] | None = None, ingredients: Ingredients | None = None, chunk: int = 32) -> None:
+                 sensors: Sequence[str] | None = None, ingredients: Ingredients | None = None, chunk: int = 64) -> None:
         if split not in SPLITS:
             raise ValueError(f"unknown split '{split}': choose one of {', '.join(SPLITS)}")
         self.device = torch.device(device)
@@ -146,7 +146,7 @@ class SyntheticHands:
         scene = stage.scene
         center, side = self._cubes(stage)
         view, inside = self._window(stage, center, side)
-        clean, own = self._render(stage, view)
+        clean, own = self._render(stage, view, center[:, 2] + side / 2)
         clean = torch.where(inside, clean, 0)
         depth = self._sense(stage, clean, view, seeds)
         joints = to_cube(scene.joints, center, side)
@@ -205,10 +205,10 @@ class SyntheticHands:
         placed, _ = scenes.place(torch.cat(vertices) * mirror, torch.cat(joints) * mirror, rotation, position)
         stage.scene.other, stage.scene.other_of, stage.scene.other_is_left = placed, chosen, left
 
-    def _render(self, stage: _Stage, view: View) -> tuple[Tensor, Tensor]:
+    def _render(self, stage: _Stage, view: View, back: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Nearness of everything, and of the hand alone."""
         relief = scenes.smooth_relief(Random(stage.seeds).fork(_FURNITURE).fork(99), view)
-        image = scenes.draw_solids(stage.scene, view, relief)
+        image = scenes.draw_solids(stage.scene, view, back, relief)
         own, others = scenes.draw_hands(stage.scene, self._faces, view)
         if others is not None:
             image[stage.scene.other_of] = torch.maximum(image[stage.scene.other_of], others)
@@ -242,7 +242,7 @@ class SyntheticHands:
         view = View(focal, focal, middle - x / z * focal, middle - y / z * focal, _COARSE, _COARSE)
         scene = stage.scene
         hand = scenes.splat(scene.vertices[:, self._hand_vertices], view)
-        image = torch.maximum(scenes.draw_solids(scene, view), torch.where(scene.present[:, None, None], hand, 0))
+        image = torch.maximum(scenes.draw_solids(scene, view, stage.position[:, 2] + CUBE_SIDE), torch.where(scene.present[:, None, None], hand, 0))
         if scene.other is not None:
             image[scene.other_of] = torch.maximum(image[scene.other_of], scenes.splat(scene.other, view[scene.other_of]))
         ray_x, ray_y = view.rays

@@ -74,25 +74,28 @@ def rasterise(vertices: Tensor, faces: Tensor, view: View) -> Tensor:
     """
     batch, height, width = len(vertices), view.height, view.width
     image = vertices.new_zeros(batch * height * width)
-    z = vertices[..., 2]
-    safe = torch.where(z > NEAR, z, NEAR)
-    u = vertices[..., 0] / safe * view.fx[:, None] + view.cx[:, None]
-    v = vertices[..., 1] / safe * view.fy[:, None] + view.cy[:, None]
-    u, v, w, front = (a[:, faces.T].transpose(0, 1) for a in (u, v, 1 / safe, z > NEAR))  # each (3, B, F)
+    x, y, z = (vertices[..., i].T.contiguous() for i in range(3))  # (V, B): gathering corners then copies whole rows
+    safe = z.clamp(min=NEAR)
+    nearness = 1 / safe
+    corners = [torch.stack([t[corner] for corner in faces.T]) for t in (
+        x * nearness * view.fx + view.cx, y * nearness * view.fy + view.cy, nearness)]
+    u, v, w = corners  # each (3, F, B)
 
     twice_area = (u[1] - u[0]) * (v[2] - v[0]) - (v[1] - v[0]) * (u[2] - u[0])
-    left = u.amin(0).ceil().clamp(min=0)
-    right = u.amax(0).floor().clamp(max=width - 1)
-    top = v.amin(0).ceil().clamp(min=0)
-    bottom = v.amax(0).floor().clamp(max=height - 1)
-    keep = (twice_area < 0) & (right >= left) & (bottom >= top) & front.all(0)
-    sample, face = keep.nonzero(as_tuple=True)
-    chosen = sample * keep.shape[1] + face
+    left = torch.minimum(torch.minimum(u[0], u[1]), u[2]).ceil_().clamp_(min=0)
+    right = torch.maximum(torch.maximum(u[0], u[1]), u[2]).floor_().clamp_(max=width - 1)
+    top = torch.minimum(torch.minimum(v[0], v[1]), v[2]).ceil_().clamp_(min=0)
+    bottom = torch.maximum(torch.maximum(v[0], v[1]), v[2]).floor_().clamp_(max=height - 1)
+    nearest = torch.maximum(torch.maximum(w[0], w[1]), w[2])
+    keep = (twice_area < 0) & (right >= left) & (bottom >= top) & (nearest < 1 / NEAR)
+    chosen = keep.reshape(-1).nonzero()[:, 0]
+    sample = chosen % batch
     u, v, w = (a.reshape(3, -1)[:, chosen] for a in (u, v, w))
     left, right, top, bottom, twice_area = (a.reshape(-1)[chosen] for a in (left, right, top, bottom, twice_area))
     extent = torch.maximum(right - left, bottom - top) + 1
 
-    # Barycentric coordinates of corners 1 and 2 and the nearness as affine functions of the pixel: (gu, gv, at corner 0).
+    # Barycentric coordinates of corners 1 and 2, and the nearness, as affine functions of the pixel:
+    # slopes along u and v, and the value at corner 0.
     inverse = 1 / twice_area
     b1 = ((v[2] - v[0]) * inverse, (u[0] - u[2]) * inverse)
     b2 = ((v[0] - v[1]) * inverse, (u[1] - u[0]) * inverse)
@@ -115,17 +118,19 @@ def rasterise(vertices: Tensor, faces: Tensor, view: View) -> Tensor:
             begin_v = begin_v[owner] + torch.div(number, across[owner], rounding_mode='floor') * size
             members = members[owner]
         begin_u, begin_v = begin_u.clamp(max=width - size_u), begin_v.clamp(max=height - size_v)
-        p1, q1, p2, q2, pw, qw, u0, v0, w0 = affine[:, members].unbind(0)
-        du = (begin_u - u0)[:, None] + torch.arange(size_u, device=image.device)
-        dv = (begin_v - v0)[:, None] + torch.arange(size_v, device=image.device)
-        first = (p1[:, None] * du)[:, None, :] + (q1[:, None] * dv)[:, :, None]
-        second = (p2[:, None] * du)[:, None, :] + (q2[:, None] * dv)[:, :, None]
-        inside = torch.minimum(torch.minimum(first, second), 1 - first - second) >= _INSIDE
-        nearness = (pw[:, None] * du)[:, None, :] + (w0[:, None] + qw[:, None] * dv)[:, :, None]
+        p1, q1, p2, q2, pw, qw, u0, v0, w0 = affine[:, members, None].unbind(0)
+        across, down = torch.arange(size_u, device=image.device), torch.arange(size_v, device=image.device)
+        du, dv = begin_u[:, None] - u0 + across, begin_v[:, None] - v0 + down
+        first = (p1 * du)[:, None, :] + (q1 * dv)[:, :, None]
+        second = (p2 * du)[:, None, :] + (q2 * dv)[:, :, None]
+        nearness = (pw * du)[:, None, :] + (w0 + qw * dv)[:, :, None]
+        third = 1 - first
+        third -= second
+        inside = torch.minimum(torch.minimum(first, second), third) >= _INSIDE
+        covered = inside.reshape(-1).nonzero()[:, 0]
         start = (sample[members] * height + begin_v.long()) * width + begin_u.long()
-        offset = (torch.arange(size_v, device=image.device)[:, None] * width
-                  + torch.arange(size_u, device=image.device))
-        image.scatter_reduce_(0, (start[:, None, None] + offset)[inside], nearness[inside], 'amax')
+        pixel = start[:, None, None] + (down[:, None] * width + across)
+        image.scatter_reduce_(0, pixel.reshape(-1)[covered], nearness.reshape(-1)[covered], 'amax')
     return image.reshape(batch, height, width)
 
 

@@ -27,16 +27,37 @@ _BASES = torch.tensor([[[0, -1, 0], [0, 0, -1]], [[0, -0.6, 0.8], [0, 0.8, 0.6]]
                        [[0, -1, 0], [1, 0, 0]], [[0, -1, 0], [0, 0, -1]]], dtype=torch.float32)
 _SCATTER = torch.tensor([[0.45, 0.7], [0.5, 0.7], [0.4, 3.0], [0.5, 1.0], [3.0, 3.0]])
 _TURNED = torch.tensor([0.3, 0.4, 0.25, 0.5, 0.5])  # chance of the other face of the hand
+_HALF_HAND = 0.10  # m
 _ARM_NEAR = 0.12  # a forearm that comes this close to the camera, in metres, would come out of the camera
 
 
 @dataclass
 class Solid:
-    """A simple solid that some samples of a batch contain: `draw(*measures, view)` with measures (K, ...) for `samples` (K,)."""
+    """One kind of solid, in some samples of a batch.
+
+    Attributes:
+        draw: of `renderer`; its arguments are the measures and a view.
+        samples: (K,) that contain it.
+        measures: each (K, ...).
+        center, radius: (K, 3), (K,) of a ball around it, or None where there is no end to it.
+    """
 
     draw: Callable[..., Tensor]
     samples: Tensor
     measures: tuple[Tensor, ...]
+    center: Tensor | None = None
+    radius: Tensor | None = None
+
+    def within(self, view: View, back: Tensor) -> Solid:
+        """Those of it that may be seen in the `view` before the distance `back` (B,)."""
+        if self.center is None or self.radius is None:
+            return self
+        view, back = view[self.samples], back[self.samples]
+        (u, v), r = view.project(self.center[:, None]), self.radius
+        reach = torch.maximum(view.fx, view.fy) * r * 1.5 / (self.center[:, 2] - r).clamp(min=0.05)
+        seen = ((self.center[:, 2] - r < back) & (u[:, 0] > -reach) & (u[:, 0] < view.width + reach)
+                & (v[:, 0] > -reach) & (v[:, 0] < view.height + reach)).nonzero()[:, 0]
+        return Solid(self.draw, self.samples[seen], tuple(m[seen] for m in self.measures))
 
 
 @dataclass
@@ -116,8 +137,10 @@ def sample_positions(rng: Random, sensor: Tensor) -> Tensor:
     table = lambda name: sensor_table(name, sensor.device)[sensor]  # noqa: E731
     near, far = table('hand_distance').unbind(1)
     z = near + (far - near) * rng.uniform()
-    offset = torch.where(rng.chance(0.1)[:, None], rng.uniform(2, low=-0.5, high=0.5), rng.normal(2, std=0.14).clamp(-0.4, 0.4))
-    u, v = offset[:, 0] * table('width'), offset[:, 1] * table('height')
+    size, focal = torch.stack([table('width'), table('height')], 1), torch.stack([table('fx'), table('fy')], 1)
+    whole = (size / 2 - _HALF_HAND * focal / z[:, None]).clamp(min=0)  # as far from the middle a hand is not cut off
+    middling = torch.maximum(torch.minimum(rng.normal(2) * 0.16 * size, whole), -whole)
+    u, v = torch.where(rng.chance(0.12)[:, None], rng.uniform(2, low=-0.5, high=0.5) * size, middling).unbind(1)
     u, v = u + (table('width') / 2 - table('cx')), v + (table('height') / 2 - table('cy'))
     return torch.stack([u / table('fx') * z, v / table('fy') * z, z], 1)
 
@@ -154,9 +177,21 @@ class Furnisher:
         return (rng.uniform() < table[self.view]).nonzero()[:, 0]
 
     @staticmethod
-    def _add(to: list[Solid], draw: Callable[..., Tensor], samples: Tensor, *measures: Tensor) -> None:
-        if len(samples):
-            to.append(Solid(draw, samples, tuple(m[samples] for m in measures)))
+    def _ellipsoid(to: list[Solid], samples: Tensor, center: Tensor, axes: Tensor, radii: Tensor) -> None:
+        center, axes, radii = center[samples], axes[samples], radii[samples]
+        to.append(Solid(renderer.ellipsoid, samples, (center, axes, radii), center, radii.amax(1)))
+
+    @staticmethod
+    def _box(to: list[Solid], samples: Tensor, center: Tensor, axes: Tensor, half: Tensor) -> None:
+        center, axes, half = center[samples], axes[samples], half[samples]
+        to.append(Solid(renderer.box, samples, (center, axes, half), center, dot(half, half).sqrt()))
+
+    @staticmethod
+    def _cone(to: list[Solid], samples: Tensor, start: Tensor, end: Tensor, radius: Tensor, end_radius: Tensor) -> None:
+        start, end, radius, end_radius = start[samples], end[samples], radius[samples], end_radius[samples]
+        along = end - start
+        to.append(Solid(renderer.round_cone, samples, (start, end, radius, end_radius), (start + end) / 2,
+                        dot(along, along).sqrt() / 2 + torch.maximum(radius, end_radius)))
 
     def surface(self) -> None:
         """A table under the hand or a wall behind it: a plane that arm and hand touch or stay clear of."""
@@ -169,7 +204,7 @@ class Furnisher:
         normal = torch.where(normal[:, 2:] < 0.2, away, normal)
         touch = dot(normal[:, None], self.scene.vertices).amax(1)
         gap = torch.where(rng.chance(0.25), 0.0, -torch.log(1 - rng.uniform()) * 0.25)
-        self._add(self.scene.soft, renderer.plane, samples, normal, touch + gap)
+        self.scene.soft.append(Solid(renderer.plane, samples, (normal[samples], (touch + gap)[samples])))
 
     def body(self) -> None:
         """Torso, head and upper arm of the person whose hand it is, behind the hand."""
@@ -181,15 +216,15 @@ class Furnisher:
         center = torch.stack([self.center[:, 0] + rng.normal(std=0.16), self.center[:, 1] + rng.uniform(low=-0.1, high=0.45),
                               self.far + gap + torso[:, 2]], 1)
         axes = _spin(torch.eye(3, device=rng.device).expand(len(rng), 3, 3), 2, rng.normal(std=0.15))
-        self._add(self.scene.soft, renderer.ellipsoid, samples, center, axes, torso)
+        self._ellipsoid(self.scene.soft, samples, center, axes, torso)
         head = size * torch.tensor([0.078, 0.118, 0.098], device=rng.device)
         nod = rng.normal(3, std=0.03)
         above = torch.stack([nod[:, 0], -torso[:, 1] - 0.09 + nod[:, 1], nod[:, 2]], 1)
-        self._add(self.scene.soft, renderer.ellipsoid, samples, center + above, axes, head)
+        self._ellipsoid(self.scene.soft, samples, center + above, axes, head)
         shoulder = center + torch.stack([torso[:, 0] * torch.where(rng.chance(0.5), 0.95, -0.95), -0.75 * torso[:, 1],
                                          torch.zeros_like(gap)], 1)
         thick = 0.042 * size[:, 0]
-        self._add(self.scene.soft, renderer.round_cone, samples, self.elbow, shoulder, thick, thick * 1.35)
+        self._cone(self.scene.soft, samples, self.elbow, shoulder, thick, thick * 1.35)
 
     def sleeve(self) -> None:
         """A sleeve from somewhere along the forearm to the elbow, loose or tight."""
@@ -198,7 +233,7 @@ class Furnisher:
         wrist = self.scene.joints[:, 0]
         cuff = wrist + (self.elbow - wrist) * rng.uniform(1, low=0.12, high=0.8)
         width = rng.uniform(low=0.034, high=0.052)
-        self._add(self.scene.soft, renderer.round_cone, samples, cuff, self.elbow, width, width * rng.uniform(low=1.0, high=1.4))
+        self._cone(self.scene.soft, samples, cuff, self.elbow, width, width * rng.uniform(low=1.0, high=1.4))
 
     def held(self) -> None:
         """A ball, a bar or a flat box in the hand."""
@@ -212,13 +247,13 @@ class Furnisher:
         center = palm + 0.5 * (joints[:, (4, 8, 12, 16)].mean(1) - palm)
         axis = _normalize(across + rng.normal(3, std=0.25))
         reach = axis * rng.uniform(1, low=0.04, high=0.13)
-        self._add(self.scene.hard, renderer.ellipsoid, (chosen & (what < 0.35)).nonzero()[:, 0], center,
+        self._ellipsoid(self.scene.hard, (chosen & (what < 0.35)).nonzero()[:, 0], center,
                   random_rotation(rng), radius[:, None] * rng.uniform(3, low=0.8, high=1.3))
-        self._add(self.scene.hard, renderer.round_cone, (chosen & (what >= 0.35) & (what < 0.75)).nonzero()[:, 0],
+        self._cone(self.scene.hard, (chosen & (what >= 0.35) & (what < 0.75)).nonzero()[:, 0],
                   center - reach, center + reach, radius * 0.7, radius * 0.7)
         frame = torch.stack([across, along, palmar], 2)
         half = rng.uniform(3, low=0.7, high=1.3) * torch.tensor([0.036, 0.07, 0.007], device=rng.device)
-        self._add(self.scene.hard, renderer.box, (chosen & (what >= 0.75)).nonzero()[:, 0], center, frame, half)
+        self._box(self.scene.hard, (chosen & (what >= 0.75)).nonzero()[:, 0], center, frame, half)
 
     def clutter(self) -> None:
         """Things behind, beside and before the hand."""
@@ -232,12 +267,12 @@ class Furnisher:
             center = torch.stack([self.center[:, 0] + aside[:, 0], self.center[:, 1] + aside[:, 1], z], 1)
             axes = random_rotation(rng)
             chosen = chosen & (center[:, 2] - size.amax(1) > 0.1)
-            self._add(self.scene.hard, renderer.ellipsoid, (chosen & (what < 0.3)).nonzero()[:, 0], center, axes, size)
-            self._add(self.scene.hard, renderer.box, (chosen & (what >= 0.3) & (what < 0.65)).nonzero()[:, 0], center, axes, size)
+            self._ellipsoid(self.scene.hard, (chosen & (what < 0.3)).nonzero()[:, 0], center, axes, size)
+            self._box(self.scene.hard, (chosen & (what >= 0.3) & (what < 0.65)).nonzero()[:, 0], center, axes, size)
             end = axes[..., 0] * (0.3 if before else 0.5)
             end = torch.stack([end[:, 0], end[:, 1], end[:, 2].abs() * 0.5], 1)
             thin = size[:, 1] * (0.5 if before else 0.4)
-            self._add(self.scene.hard, renderer.round_cone, (chosen & (what >= 0.65)).nonzero()[:, 0], center, center + end,
+            self._cone(self.scene.hard, (chosen & (what >= 0.65)).nonzero()[:, 0], center, center + end,
                       thin, thin * 1.2)
 
     def no_hand(self) -> None:
@@ -247,11 +282,11 @@ class Furnisher:
         axes = random_rotation(rng)
         reach = axes[..., 0] * rng.uniform(1, low=0.06, high=0.22)
         thick = rng.uniform(low=0.02, high=0.055)
-        self._add(self.scene.soft, renderer.round_cone, (absent & (what < 0.45)).nonzero()[:, 0], self.center - reach,
+        self._cone(self.scene.soft, (absent & (what < 0.45)).nonzero()[:, 0], self.center - reach,
                   self.center + reach, thick, thick * rng.uniform(low=0.9, high=1.4))
-        self._add(self.scene.soft, renderer.ellipsoid, (absent & (what >= 0.45) & (what < 0.75)).nonzero()[:, 0], self.center,
+        self._ellipsoid(self.scene.soft, (absent & (what >= 0.45) & (what < 0.75)).nonzero()[:, 0], self.center,
                   axes, rng.uniform(3, low=0.06, high=0.13))
-        self._add(self.scene.hard, renderer.box, (absent & (what >= 0.75) & (what < 0.9)).nonzero()[:, 0], self.center, axes,
+        self._box(self.scene.hard, (absent & (what >= 0.75) & (what < 0.9)).nonzero()[:, 0], self.center, axes,
                   rng.uniform(3, low=0.02, high=0.12))
 
 
@@ -262,12 +297,21 @@ def furnish(rng: Random, scene: Scene, view: Tensor, elbow: Tensor) -> None:
         add()
 
 
-def draw_solids(scene: Scene, view: View, relief: Tensor | None = None) -> Tensor:
-    """Nearness (B, H, W) of everything but hands; `relief` (B, H, W) in metres is laid over what is soft."""
+def draw_solids(scene: Scene, view: View, back: Tensor | None = None, relief: Tensor | None = None) -> Tensor:
+    """Nearness (B, H, W) of everything but hands.
+
+    Args:
+        back: (B,) metres; what lies wholly behind it may be left out.
+        relief: (B, H, W) metres, laid over what is soft.
+    """
     image = torch.zeros(len(scene.present), view.height, view.width, device=scene.joints.device)
     for solids in (scene.soft, scene.hard):
         for solid in solids:
-            image[solid.samples] = torch.maximum(image[solid.samples], solid.draw(*solid.measures, view[solid.samples]))
+            if back is not None:
+                solid = solid.within(view, back)
+            if len(solid.samples):
+                shown = solid.draw(*solid.measures, view[solid.samples])
+                image[solid.samples] = torch.maximum(image[solid.samples], shown)
         if solids is scene.soft and relief is not None:
             image = image / (1 + image * relief)
     return image

@@ -15,31 +15,30 @@ def open_dataset(name: str, split: str, root: Path | None = None, device: str = 
     """A dataset by name.
 
     Args:
-        name: one of `DATASETS`.
-        split: 'train', 'val' or 'test'.
+        name: one of `DATASETS`; 'msra:P3' leaves out the subject P3.
+        split: 'train', 'val' or 'test'; nyu and icvl also have 'test_1' and 'test_2'.
         root: folder of a recorded dataset.
         device: where synthetic hands are rendered.
 
     Raises:
         DatasetError: no such dataset or split, or its files are missing.
     """
-    if name not in DATASETS:
-        raise DatasetError(f"unknown dataset '{name}': choose one of {', '.join(DATASETS)}")
-    if split not in ('train', 'val', 'test'):
-        raise DatasetError(f"unknown split '{split}': choose train, val or test")
-    if name == 'synthetic':
+    kind, _, variant = name.partition(':')
+    if kind not in DATASETS or (variant and kind != 'msra'):
+        raise DatasetError(f"unknown dataset '{name}': choose one of {', '.join(DATASETS)}, or msra:P1 to msra:P8")
+    if kind == 'synthetic':
         from hand_pose_ros.datasets.synthetic import Synthetic
         return Synthetic(split, device)
     if root is None:
         raise DatasetError(f'{name} is read from disk: give its folder with --set root=FOLDER')
-    if name == 'nyu':
+    if kind == 'nyu':
         from hand_pose_ros.datasets.nyu import NYU
         return NYU(root, split)
-    if name == 'icvl':
+    if kind == 'icvl':
         from hand_pose_ros.datasets.icvl import ICVL
         return ICVL(root, split)
-    if name == 'msra':
+    if kind == 'msra':
         from hand_pose_ros.datasets.msra import MSRA
-        return MSRA(root, split)
+        return MSRA(root, split, variant or 'P0')
     from hand_pose_ros.datasets.bags import Bags
     return Bags(root, split)

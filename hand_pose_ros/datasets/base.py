@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+import hand_pose_ros.geometry
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.geometry import Cube, Intrinsics, crop
 from hand_pose_ros.skeleton import Skeleton
@@ -120,12 +124,42 @@ def joints_in_metres(joints: Tensor, cube_center: Tensor, cube_side: Tensor) -> 
     return torch.cat([points[..., :2] * (points[..., 2:] / center[..., 2:]), points[..., 2:]], dim=-1)
 
 
-def require_file(path: Path, dataset: str, what: str) -> Path:
-    """`path`, if it is there.
+def require(dataset: str, paths: Iterable[Path]) -> None:
+    """Make sure that files are there.
 
     Raises:
-        DatasetError: it is not; the sentence says which file is expected where.
+        DatasetError: some are not; the sentence names the first.
     """
-    if not path.is_file():
-        raise DatasetError(f'{dataset}: {path} is missing ({what}); give the folder that holds it with --set root=FOLDER')
-    return path
+    missing = [path for path in paths if not path.is_file()]
+    if missing:
+        others = f' (and {len(missing) - 1} more files)' if len(missing) > 1 else ''
+        raise DatasetError(f'{dataset}: {missing[0]} is missing{others}; is the download complete, and is --set root= '
+                           'the folder described in docs/training.md?')
+
+
+def read_depth(path: Path, dataset: str, channels: int = 1) -> NDArray[np.uint16]:
+    """A depth PNG as it is stored, (H, W) uint16 or, with 3 channels, (H, W, 3) uint8 blue, green, red.
+
+    Raises:
+        DatasetError: the file is missing, damaged or of another kind.
+    """
+    data = np.fromfile(path, np.uint8) if path.is_file() else None
+    if data is None:
+        raise DatasetError(f'{dataset}: {path} is missing; is the download complete?')
+    image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+    if image is None:
+        raise DatasetError(f'{dataset}: {path} is damaged; copy or download it again')
+    if (image.ndim, image.dtype) != ((2, np.uint16) if channels == 1 else (3, np.uint8)):
+        raise DatasetError(f'{dataset}: {path} is not a depth image of this dataset: it has shape {image.shape} '
+                           f'and type {image.dtype}')
+    return image
+
+
+def fingerprint(name: str, *parts: bytes) -> str:
+    """A name for caches that changes with the parts and with the code that makes samples here."""
+    digest = hashlib.sha256()
+    for path in (*sorted(Path(__file__).parent.glob('*.py')), Path(hand_pose_ros.geometry.__file__)):
+        digest.update(path.read_bytes())
+    for part in parts:
+        digest.update(part)
+    return f'{name}-{digest.hexdigest()[:12]}'

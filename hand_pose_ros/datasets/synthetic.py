@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 import hand_pose_ros.synthetic
-from hand_pose_ros.datasets.base import Batch, Dataset
+from hand_pose_ros.datasets.base import Batch, Dataset, DatasetError
 from hand_pose_ros.skeleton import HAND21
 
 LEFT = 1
@@ -27,7 +27,10 @@ class Synthetic(Dataset):
         from hand_pose_ros.synthetic.generator import SyntheticHands
         self.name = f'synthetic-{split}'
         self.device = torch.device(device)
-        self._hands = SyntheticHands(split, device=device)
+        try:
+            self._hands = SyntheticHands(split, device=device)
+        except ValueError as error:
+            raise DatasetError(f'synthetic: {error}') from error
         # Any change of the code that makes the samples makes other samples.
         sources = sorted(Path(hand_pose_ros.synthetic.__path__[0]).glob('*.py'))
         code = hashlib.sha256(b''.join(path.read_bytes() for path in sources)).hexdigest()

@@ -1,0 +1,87 @@
+"""ICVL hand posture (Tang et al. 2014): about 22,000 genuine training frames, 1,596 test frames in two sequences."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from hand_pose_ros.datasets.base import DatasetError, LabelledFrame, RecordedDataset, fingerprint, read_depth, require
+from hand_pose_ros.geometry import Intrinsics
+from hand_pose_ros.skeleton import get_skeleton
+
+INTRINSICS = Intrinsics(241.42, 241.42, 160.0, 120.0, 320, 240)
+PALM = 0
+CUBE_SIDE = 0.250
+
+ROTATED_COPY = 6
+"""Frames in folders with names of at most so many characters are turned copies of others; genuine ones have dates."""
+
+
+class ICVL(RecordedDataset):
+    """`root`/{train.txt or labels.txt, test_seq_1.txt, test_seq_2.txt} and `root`/Depth/, or these under Training/ and
+    Testing/, as distributed.
+
+    Splits: train and val (the genuine training frames; val is the sequence that is last by name), test, and test_1 and
+    test_2, its two sequences.
+    """
+
+    skeleton = get_skeleton('icvl16')
+
+    def __init__(self, root: Path, split: str) -> None:
+        self.name = f'icvl-{split}'
+        training = split in ('train', 'val')
+        files = {'train': ['labels.txt', 'train.txt'], 'val': ['labels.txt', 'train.txt'], 'test_1': ['test_seq_1.txt'],
+                 'test_2': ['test_seq_2.txt']}
+        if split == 'test':
+            lists = [_find(root, 'Testing', files[part]) for part in ('test_1', 'test_2')]
+        elif split in files:
+            lists = [_find(root, 'Training' if training else 'Testing', files[split])]
+        else:
+            raise DatasetError(f"ICVL: unknown split '{split}': choose one of train, val, test, test_1, test_2")
+        frames = [frame for path in lists for frame in _read(path)]
+        if training:
+            frames = [frame for frame in frames if len(_sequence(frame[0])) > ROTATED_COPY]
+            if not frames:
+                raise DatasetError(f'ICVL: {lists[0]} lists no genuine frames (in folders named by date)')
+            last = max(_sequence(path) for path, _ in frames)
+            frames = [frame for frame in frames if (_sequence(frame[0]) == last) == (split == 'val')]
+        self._depth = lists[0].parent / 'Depth'
+        self._frames = frames
+        self.size = len(frames)
+        require('ICVL', (self._depth / path for path, _ in frames))
+        self.fingerprint = fingerprint(self.name, *(f'{path}{uvd.tolist()}'.encode() for path, uvd in frames))
+
+    def frame(self, index: int) -> LabelledFrame:
+        path, uvd = self._frames[index]
+        depth = read_depth(self._depth / path, 'ICVL').astype(np.float32) / 1000
+        joints = INTRINSICS.back_project(uvd[:, :2], uvd[:, 2] / 1000)
+        return LabelledFrame(depth, INTRINSICS, joints, joints[PALM], CUBE_SIDE)
+
+
+def _find(root: Path, part: str, names: list[str]) -> Path:
+    for folder in (root, root / part):
+        for name in names:
+            if (folder / name).is_file():
+                return folder / name
+    raise DatasetError(f'ICVL: neither {root} nor {root / part} holds {" or ".join(names)}; '
+                       'give the folder of the dataset with --set root=FOLDER')
+
+
+def _sequence(path: str) -> str:
+    return path.split('/')[0]
+
+
+def _read(path: Path) -> list[tuple[str, np.ndarray]]:
+    """Image path and (16, 3) u, v in pixels and depth in mm, line by line; blank lines are skipped."""
+    frames = []
+    for number, line in enumerate(path.read_text().splitlines(), 1):
+        words = line.split()
+        if not words:
+            continue
+        try:
+            frames.append((words[0], np.array(words[1:], np.float64).reshape(16, 3)))
+        except ValueError as error:
+            raise DatasetError(f'ICVL: line {number} of {path} is not an image path and 16 x (u v d); '
+                               'is the file complete?') from error
+    return frames

@@ -1,0 +1,68 @@
+"""NYU hand pose (Tompson et al. 2014): one camera, 72,757 training and 8,252 test frames of two other subjects."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.io import loadmat
+
+from hand_pose_ros.datasets.base import DatasetError, LabelledFrame, RecordedDataset, fingerprint, read_depth, require
+from hand_pose_ros.geometry import Intrinsics
+from hand_pose_ros.skeleton import get_skeleton
+
+INTRINSICS = Intrinsics(588.03, 587.07, 320.0, 240.0, 640, 480)
+
+JOINTS = (0, 3, 6, 9, 12, 15, 18, 21, 24, 25, 27, 30, 31, 32)
+"""The 14 that are evaluated, of the 36 labelled ones; in the order of the skeleton nyu14."""
+PALM = 13
+
+FIRST_SUBJECT = 2440
+"""Test frames of the first subject; the rest shows a smaller hand."""
+HELD_OUT = 0.05
+"""Share of the training frames, the last ones, that validate: the training set has a single subject."""
+
+
+class NYU(RecordedDataset):
+    """`root`/{train,test}/joint_data.mat with depth_1_%07d.png beside it, as distributed.
+
+    Splits: train and val (the training frames), test, and test_1 and test_2, its two subjects.
+    """
+
+    skeleton = get_skeleton('nyu14')
+
+    def __init__(self, root: Path, split: str) -> None:
+        self.name = f'nyu-{split}'
+        self._folder = root / ('train' if split in ('train', 'val') else 'test')
+        labels = self._folder / 'joint_data.mat'
+        require('NYU', [labels])
+        try:
+            joints = np.asarray(loadmat(labels, variable_names=['joint_xyz'])['joint_xyz'][0])  # of camera 1
+            joints = joints[:, JOINTS]
+        except Exception as error:  # scipy raises what it likes on a damaged file
+            raise DatasetError(f'NYU: {labels} is damaged or holds no joint_xyz ({error}); download it again') from error
+        self._joints = joints * (0.001, -0.001, 0.001)  # mm with y up -> m with y down
+        count = len(joints)
+        held_out = max(1, round(count * HELD_OUT))
+        parts = {'train': range(count - held_out), 'val': range(count - held_out, count), 'test': range(count),
+                 'test_1': range(min(FIRST_SUBJECT, count)), 'test_2': range(FIRST_SUBJECT, count)}
+        if split not in parts:
+            raise DatasetError(f"NYU: unknown split '{split}': choose one of {', '.join(parts)}")
+        self._frames = parts[split]
+        self.size = len(self._frames)
+        require('NYU', (self._path(frame) for frame in self._frames))
+        self.fingerprint = fingerprint(self.name, self._joints.tobytes())
+
+    def _path(self, frame: int) -> Path:
+        return self._folder / f'depth_1_{frame + 1:07d}.png'
+
+    def frame(self, index: int) -> LabelledFrame:
+        """Depth is packed in two channels: green holds the high byte, blue the low one; 2001 and above is no reading."""
+        frame = self._frames[index]
+        image = read_depth(self._path(frame), 'NYU', channels=3).astype(np.uint16)
+        millimetres = image[..., 1] << 8 | image[..., 0]
+        depth = np.where(millimetres < 2001, millimetres, 0).astype(np.float32) / 1000
+        joints = self._joints[frame]
+        smaller = self._folder.name == 'test' and frame >= FIRST_SUBJECT
+        # The factor is the original authors' knowledge of the subject's hand: say so with every number that uses it.
+        return LabelledFrame(depth, INTRINSICS, joints, joints[PALM], 0.300 * (0.83 if smaller else 1))

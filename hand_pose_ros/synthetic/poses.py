@@ -20,7 +20,7 @@ __all__ = ['LIMITS', 'POSE', 'PROTOTYPES', 'sample_poses']
 _FINGER_LIMITS = {'mcp_flexion': (-25, 92), 'pip_flexion': (-6, 108), 'dip_flexion': (-10, 75)}
 _LIMITS = {
     'wrist_flexion': (-65, 65), 'wrist_deviation': (-32, 22), 'ring_cmc_flexion': (0, 12), 'pinky_cmc_flexion': (0, 22),
-    'thumb_cmc_radial': (-5, 70), 'thumb_cmc_palmar': (-5, 62), 'thumb_cmc_roll': (35, 120), 'thumb_mcp_flexion': (-15, 60),
+    'thumb_cmc_radial': (-5, 76), 'thumb_cmc_palmar': (-5, 62), 'thumb_cmc_roll': (35, 120), 'thumb_mcp_flexion': (-15, 60),
     'thumb_mcp_abduction': (-12, 18), 'thumb_ip_flexion': (-25, 80), 'index_mcp_abduction': (-14, 28),
     'middle_mcp_abduction': (-14, 14), 'ring_mcp_abduction': (-14, 25), 'pinky_mcp_abduction': (-16, 44)}
 LIMITS = torch.deg2rad(torch.tensor([_LIMITS.get(n) or _FINGER_LIMITS[n.split('_', 1)[1]] for n in POSE],
@@ -35,7 +35,7 @@ _SPREAD = {'together': (-3, 0, -3, -6), 'apart': (5, 0, 4, 8), 'wide': (20, 0, 1
            'vulcan': (-4, 9, 13, 8), 'horns': (8, 0, 0, 22)}
 # Degrees: CMC radial, palmar, roll; MCP flexion, abduction; IP flexion.
 _THUMB = {
-    'out': (58, 12, 62, -8, 6, -16), 'up': (48, 22, 66, -10, 2, -14), 'side': (12, 14, 62, 4, -4, 4),
+    'out': (63, 12, 62, -9, 8, -18), 'up': (48, 22, 66, -10, 2, -14), 'side': (12, 14, 62, 4, -4, 4),
     'rest': (32, 26, 74, 10, 0, 14), 'cup': (34, 44, 88, 10, 0, 16), 'wrap': (22, 52, 100, 26, 0, 26),
     'across': (20, 47, 98, 34, 0, 48), 'tucked': (6, 34, 92, 46, 0, 34), 'key': (14, 30, 78, 16, -2, 34),
     'index': (20, 43, 98, 16, 0, 18), 'middle': (15, 50, 102, 19, 2, 16), 'ring': (11, 56, 108, 24, 5, 17),
@@ -44,7 +44,7 @@ _THUMB = {
 # Weight, curl of index to little finger, spread, thumb.
 _TABLE = (
     # open hands
-    (4.0, 'SSSS', 'together', 'side'), (4.0, 'SSSS', 'apart', 'rest'), (6.0, 'SSSS', 'wide', 'out'), (3.0, 'SSSS', 'apart', 'out'),
+    (4.0, 'SSSS', 'together', 'side'), (4.0, 'SSSS', 'apart', 'rest'), (8.0, 'SSSS', 'wide', 'out'), (3.0, 'SSSS', 'apart', 'out'),
     (2.0, 'OOOO', 'wide', 'out'), (1.0, 'SSSS', 'vulcan', 'out'), (2.0, 'SSSS', 'together', 'out'),
     # relaxed, half closed
     (5.0, 'RRRR', 'apart', 'rest'), (4.0, 'CCHH', 'together', 'rest'), (3.0, 'HHHH', 'together', 'rest'), (2.0, 'RHHG', 'together', 'side'),
@@ -92,7 +92,7 @@ def _gestures(rng: Random) -> Tensor:
     """One prototype, or something between two of them, each finger on its own way at times."""
     table, weights = PROTOTYPES.to(rng.device), torch.tensor([row[0] for row in _TABLE])
     first, second = table[rng.choice(weights)], table[rng.choice(weights)]
-    way = torch.where(rng.chance(0.4, 1), torch.zeros(()), rng.uniform(1))
+    way = torch.where(rng.chance(0.45, 1), torch.zeros(()), rng.uniform(1))
     apart = torch.where(rng.chance(0.3, 1), 0.5 * rng.normal(5), torch.zeros(()))
     way = (way + apart * (way > 0)).clamp(0, 1)  # (B, 5): thumb to little finger
     digit = torch.zeros(len(POSE), dtype=torch.int64)

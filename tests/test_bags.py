@@ -1,0 +1,286 @@
+"""What bags promise: three formats in, frame by frame with their camera; complete or not there at all when written."""
+
+import struct
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.typesys import Stores, get_typestore
+
+from hand_pose_ros.bags import Bag, BagWriter, DepthBag, read_hands
+from hand_pose_ros.bags.bag import typestore
+from hand_pose_ros.errors import InputError
+from hand_pose_ros.geometry import Cube, Intrinsics
+from hand_pose_ros.skeleton import HAND21
+
+CAMERA = Intrinsics(300.5, 301.5, 31.5, 23.5, 64, 48)
+STAMPS = [1_700_000_000_123_456_789 + i * 33_000_000 for i in range(12)]
+BASE = 'depth/image_rect'
+
+
+@pytest.fixture(scope='module')
+def depths():
+    units = np.random.default_rng(3).integers(0, 4000, (len(STAMPS), 48, 64), np.uint16)
+    return [image * np.float32(0.001) for image in units]
+
+
+def hand(seed):
+    rng = np.random.default_rng(seed)
+    return SimpleNamespace(
+        id=f'hand_{seed}', side=('left', 'right')[seed % 2], score=0.75, joints=rng.normal(size=(21, 3)).astype('f4'),
+        confidence=rng.random(21).astype('f4'), cube=Cube((0.1, -0.2, 0.6), 0.25))
+
+
+def write(path, depths, codec=None, **options):
+    with BagWriter(path, **options) as bag:
+        for stamp, depth in zip(STAMPS, depths, strict=True):
+            bag.write_depth(stamp, 'camera_optical', depth, CAMERA, codec=codec)
+    return path
+
+
+def write_ros1(path, depths, camera_first=True, encoding='16UC1'):
+    store = get_typestore(Stores.ROS1_NOETIC)
+    types, kinds = store.types, ('sensor_msgs/msg/CameraInfo', 'sensor_msgs/msg/Image')
+    with Writer1(path) as bag:
+        info, image = (bag.add_connection(topic, kind, typestore=store)
+                       for topic, kind in zip(('/cam/camera_info', '/cam/image'), kinds, strict=True))
+        for i, (stamp, depth) in enumerate(zip(STAMPS, depths, strict=True)):
+            header = types['std_msgs/msg/Header'](
+                seq=i, stamp=types['builtin_interfaces/msg/Time'](*divmod(stamp, 10**9)), frame_id='cam')
+            k = np.array([CAMERA.fx, 0, CAMERA.cx, 0, CAMERA.fy, CAMERA.cy, 0, 0, 1])
+            messages = [
+                (info, kinds[0], types[kinds[0]](
+                    header, 48, 64, 'plumb_bob', np.zeros(5), k, np.eye(3).ravel(), np.insert(k, [3, 6, 9], 0), 0, 0,
+                    types['sensor_msgs/msg/RegionOfInterest'](0, 0, 0, 0, False))),
+                (image, kinds[1], types[kinds[1]](
+                    header, 48, 64, encoding, 0, 128, np.rint(depth * 1000).astype('<u2').view(np.uint8).ravel()))]
+            for connection, kind, message in messages if camera_first else reversed(messages):
+                bag.write(connection, stamp, store.serialize_ros1(message, kind))
+    return path
+
+
+def assert_same(path, depths, **options):
+    with DepthBag(path, **options) as bag:
+        assert len(bag) == len(depths)
+        frames = list(bag)
+    assert [frame.stamp_ns for frame in frames] == STAMPS
+    for frame, depth in zip(frames, depths, strict=True):
+        np.testing.assert_array_equal(frame.depth, depth)
+        assert frame.intrinsics == CAMERA
+    return frames
+
+
+@pytest.mark.parametrize('name', ['bag.mcap', 'bag.db3', 'folder'])
+@pytest.mark.parametrize('codec', [None, 'png', 'rvl'])
+def test_depth_and_camera_come_back_as_written(tmp_path, depths, name, codec):
+    frames = assert_same(write(tmp_path / name, depths, codec), depths)
+    assert frames[0].frame_id == 'camera_optical'
+    assert frames[0].topic == f'/{BASE}' + ('/compressedDepth' if codec else '')
+
+
+def test_sqlite3_folder(tmp_path, depths):
+    path = write(tmp_path / 'folder', depths, storage='sqlite3')
+    assert list(path.glob('*.db3')) and (path / 'metadata.yaml').is_file()
+    assert_same(path, depths)
+
+
+@pytest.mark.parametrize('camera_first', [True, False])
+def test_ros1(tmp_path, depths, camera_first):
+    """Also where the first image was recorded before its camera_info."""
+    frames = assert_same(write_ros1(tmp_path / 'old.bag', depths, camera_first), depths)
+    assert frames[0].frame_id == 'cam'
+
+
+@pytest.mark.parametrize(('name', 'topic'), [
+    ('raw', ''), ('compressedDepth', '/compressedDepth'), ('compressed', '/compressed')])
+def test_recorded_bags_of_all_transports_hold_the_same_image(shared_data, name, topic):
+    given = (200.0, 200.0, 212.0, 120.0)
+    with DepthBag(shared_data / f'bags/{name}.bag', intrinsics=given) as bag:
+        assert bag.depth_topic == f'/spot/depth/frontleft/image{topic}'
+        [frame] = bag
+    assert frame.depth.shape == (240, 424) and (frame.depth > 0).sum() == 65429
+    assert frame.intrinsics == Intrinsics(*given, 424, 240)
+    with Bag(shared_data / 'bags/raw.bag') as raw:
+        [connection] = [c for c in raw.connections if c.topic == '/spot/depth/frontleft/image']
+        pixels = np.frombuffer(raw.first(connection).data, '<u2').reshape(240, 424)
+    np.testing.assert_array_equal(frame.depth, pixels * np.float32(0.001))
+
+
+def test_without_camera_info_the_remedy_is_named(shared_data):
+    wanted = '/spot/depth/frontleft/camera_info'
+    with pytest.raises(InputError, match=rf'raw\.bag: .*CameraInfo on {wanted}: give .*intrinsics'):
+        DepthBag(shared_data / 'bags/raw.bag')
+
+
+def test_colour_images_are_not_taken_for_depth(shared_data):
+    bag = DepthBag(shared_data / 'bags/raw.bag', depth_topic='/spot/camera/hand_color/image', intrinsics=(1, 1, 0, 0))
+    with bag, pytest.raises(InputError, match=r"^/spot/camera/hand_color/image: the encoding 'rgb8' is not depth"):
+        _ = next(iter(bag)).depth
+
+
+def test_a_bag_without_depth_is_refused(tmp_path, depths):
+    with pytest.raises(InputError, match=r'colour\.bag: no topic carries depth'):
+        DepthBag(write_ros1(tmp_path / 'colour.bag', depths, encoding='bgr8'))
+
+
+def test_of_several_depth_topics_one_must_be_chosen(tmp_path, depths):
+    with BagWriter(tmp_path / 'two.mcap') as bag:
+        for name in ('left', 'right'):
+            bag.write_depth(STAMPS[0], name, depths[name == 'right'], CAMERA, topic=f'/{name}/image', codec=None)
+    with pytest.raises(InputError, match=r'several topics carry depth: choose one of /left/image, /right/image'):
+        DepthBag(tmp_path / 'two.mcap')
+    with DepthBag(tmp_path / 'two.mcap', depth_topic='/right/image') as bag:
+        [frame] = bag
+    np.testing.assert_array_equal(frame.depth, depths[1])
+    with pytest.raises(InputError, match=r'no sensor_msgs/Image on /middle/image'):
+        DepthBag(tmp_path / 'two.mcap', depth_topic='/middle/image')
+
+
+def test_transports_of_one_image_are_one_topic(tmp_path, depths):
+    with BagWriter(tmp_path / 'both.mcap') as bag:
+        for codec in (None, 'png'):
+            bag.write_depth(STAMPS[0], 'camera', depths[0], CAMERA, codec=codec)
+    with DepthBag(tmp_path / 'both.mcap') as bag:
+        assert bag.depth_topic == f'/{BASE}' and len(bag) == 1
+
+
+def test_a_camera_info_of_another_size_is_refused_for_its_frame(tmp_path, depths):
+    with BagWriter(tmp_path / 'bag.mcap') as bag:
+        bag.write_depth(STAMPS[0], 'camera', depths[0], Intrinsics(300, 300, 160, 120, 320, 240))
+    with DepthBag(tmp_path / 'bag.mcap') as bag:
+        [frame] = bag
+    with pytest.raises(InputError, match=r'^/depth/image_rect/compressedDepth: .*64x48 .*320x240'):
+        _ = frame.intrinsics
+
+
+def test_the_newest_camera_info_counts(tmp_path, depths):
+    zoomed = Intrinsics(600, 600, 31.5, 23.5, 64, 48)
+    with BagWriter(tmp_path / 'zoom.mcap') as bag:
+        for stamp, camera in zip(STAMPS[:4], (CAMERA, CAMERA, zoomed, zoomed), strict=True):
+            bag.write_depth(stamp, 'camera', depths[0], camera)
+    with DepthBag(tmp_path / 'zoom.mcap') as bag:
+        assert [frame.intrinsics.fx for frame in bag] == [300.5, 300.5, 600, 600]
+
+
+def test_a_damaged_image_spoils_only_itself(tmp_path, depths):
+    path = tmp_path / 'bag.mcap'
+    with BagWriter(path) as bag:
+        for i, stamp in enumerate(STAMPS[:3]):
+            bag.write_depth(stamp, 'camera', depths[i], CAMERA, codec='rvl')
+    data = bytearray(path.read_bytes())
+    second = [i for i in range(len(data)) if data.startswith(struct.pack('<II', 64, 48), i)][1]
+    data[second:second + 8] = struct.pack('<II', 64, 480)
+    path.write_bytes(data)
+    with DepthBag(path) as bag:
+        frames = list(bag)
+    with pytest.raises(InputError, match=f'^/{BASE}/compressedDepth: .*RVL'):
+        _ = frames[1].depth
+    np.testing.assert_array_equal(frames[2].depth, depths[2])
+
+
+def read_until_damage(path):
+    """Depth images before the error, and its message."""
+    frames = []
+    with pytest.raises(InputError) as error, DepthBag(path) as bag:
+        for frame in bag:
+            frames.append(frame.depth)
+    return frames, str(error.value)
+
+
+@pytest.mark.parametrize('keep', [0.85, 0.97, 0.9999])
+def test_an_interrupted_mcap_gives_what_was_complete(tmp_path, depths, keep):
+    noise = np.random.default_rng(0).integers(1, 4000, (240, 320), np.uint16) * np.float32(0.001)
+    camera = Intrinsics(300, 300, 160, 120, 320, 240)
+    path = tmp_path / 'whole.mcap'
+    with BagWriter(path) as bag:
+        for i in range(20):
+            bag.write_depth(STAMPS[0] + i, 'camera', noise, camera, codec=None)
+    data = path.read_bytes()
+    (tmp_path / 'cut.mcap').write_bytes(data[:int(len(data) * keep)])
+    frames, said = read_until_damage(tmp_path / 'cut.mcap')
+    assert 1 <= len(frames) <= 20
+    for depth in frames:
+        np.testing.assert_array_equal(depth, noise)
+    assert 'cut.mcap: the bag was cut short' in said and 'mcap recover cut.mcap' in said
+    assert f'{len(frames)} of' in said
+
+
+def test_a_folder_without_metadata_is_read(tmp_path, depths):
+    """As `ros2 bag record` leaves it when it is killed."""
+    path = write(tmp_path / 'folder', depths)
+    (path / 'metadata.yaml').unlink()
+    assert_same(path, depths)
+
+
+@pytest.mark.parametrize(('name', 'remedy'), [
+    ('cut.bag', 'rosbag reindex cut.bag'), ('cut.db3', 'sqlite3 cut.db3 .recover'),
+    ('cut.mcap', 'mcap recover cut.mcap')])
+def test_a_bag_that_is_cut_to_pieces_names_the_repair(tmp_path, depths, name, remedy):
+    whole = tmp_path / f'whole{Path(name).suffix}'
+    write_ros1(whole, depths) if name.endswith('.bag') else write(whole, depths)
+    (tmp_path / name).write_bytes(whole.read_bytes()[:3000])
+    with pytest.raises(InputError, match=f'{name}: .*{remedy}') as error:
+        DepthBag(tmp_path / name)
+    assert '\n' not in str(error.value)
+
+
+def test_what_is_no_bag_is_refused(tmp_path):
+    (tmp_path / 'notes.txt').write_text('hello')
+    (tmp_path / 'empty.mcap').touch()
+    for name in ('missing.mcap', 'notes.txt', 'empty.mcap', '.'):
+        with pytest.raises(InputError):
+            Bag(tmp_path / name)
+
+
+def test_hands_come_back_as_written(tmp_path):
+    hands = [[], [hand(1)], [hand(2), hand(3)]]
+    with BagWriter(tmp_path / 'hands.mcap') as bag:
+        bag.write_skeleton(STAMPS[0], 'camera', HAND21, 'a network', '1.2')
+        for stamp, present in zip(STAMPS[:3], hands, strict=True):
+            bag.write_hands(stamp, 'camera', present)
+    recorded = read_hands(tmp_path / 'hands.mcap')
+    assert [record.stamp_ns for record in recorded] == STAMPS[:3]
+    for record, present in zip(recorded, hands, strict=True):
+        assert record.joints.shape[0] == len(present) and record.skeleton == 'hand21'
+        assert record.sides == tuple(h.side for h in present) and record.ids == tuple(h.id for h in present)
+        for i, h in enumerate(present):
+            np.testing.assert_array_equal(record.joints[i], h.joints)
+            np.testing.assert_array_equal(record.confidence[i], h.confidence)
+    with pytest.raises(InputError, match='named /other'):
+        read_hands(tmp_path / 'hands.mcap', topic='/other')
+
+
+def test_the_skeleton_is_recorded_latched(tmp_path):
+    with BagWriter(tmp_path / 'hands.mcap') as bag:
+        bag.write_skeleton(STAMPS[0], 'camera', HAND21, 'a network', '1.2')
+    with Bag(tmp_path / 'hands.mcap') as bag:
+        [connection] = bag.connections
+        assert connection.ext.offered_qos_profiles[0].durability.name == 'TRANSIENT_LOCAL'
+        message = bag.first(connection)
+    assert tuple(message.joint_names) == HAND21.joint_names and tuple(message.parents) == HAND21.parents
+    assert (message.name, message.model, message.model_version) == ('hand21', 'a network', '1.2')
+
+
+def test_message_types_are_those_ros_would_hash(tmp_path):
+    """The definitions in the bag are those of msg/, so a reader needs nothing but the bag."""
+    messages = pytest.importorskip('hand_pose_ros.msg')
+    for name in ('HandJoints', 'HandJointsArray', 'HandSkeleton'):
+        fields = [field for field, _ in typestore().fielddefs[f'hand_pose_ros/msg/{name}'][1]]
+        assert fields == list(getattr(messages, name).get_fields_and_field_types())
+
+
+def test_a_bag_appears_only_when_it_is_complete(tmp_path, depths):
+    path = tmp_path / 'bag.mcap'
+    path.write_text('what was there before')
+    with pytest.raises(RuntimeError), BagWriter(path) as bag:
+        bag.write_depth(STAMPS[0], 'camera', depths[0], CAMERA)
+        raise RuntimeError
+    assert path.read_text() == 'what was there before'
+    write(path, depths)
+    assert_same(path, depths)
+    assert [p.name for p in tmp_path.iterdir()] == ['bag.mcap']
+    (tmp_path / 'folder').mkdir()
+    with pytest.raises(InputError, match='something already'):
+        BagWriter(tmp_path / 'folder')

@@ -10,7 +10,7 @@ import pytest
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 
 _CHECKOUT = Path(__file__).resolve().parents[1]
-_domain = itertools.count(os.getpid() * 2)
+_domain = itertools.count(os.getpid())
 
 
 @pytest.fixture(scope='session')
@@ -29,7 +29,8 @@ def ros_domain(monkeypatch: pytest.MonkeyPatch) -> int:
     Ask for it before rclpy.init(), or for a whole file: `pytestmark = pytest.mark.usefixtures("ros_domain")`.
     """
     worker = int(os.environ.get('PYTEST_XDIST_WORKER', 'gw0').removeprefix('gw'))
-    domain = 1 + (2 * next(_domain) + worker % 2) % 100  # above 101 the ports meet the ephemeral ones
+    workers = int(os.environ.get('PYTEST_XDIST_WORKER_COUNT', '1'))
+    domain = 1 + (next(_domain) * workers + worker) % 100  # above 101 the ports meet the ephemeral ones
     monkeypatch.setenv('ROS_DOMAIN_ID', str(domain))
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     return domain

@@ -20,7 +20,9 @@ from hand_pose_ros.resources import resource, share_folder
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 PACKAGE = CHECKOUT / 'hand_pose_ros'
-MODULES = sorted(path.relative_to(CHECKOUT).as_posix() for path in PACKAGE.rglob('*.py'))
+FILES = sorted(path.relative_to(CHECKOUT).as_posix() for path in PACKAGE.rglob('*')
+               if path.is_file() and '__pycache__' not in path.parts)
+MODULES = [path for path in FILES if path.endswith('.py')]
 
 POINT = 'geometry_msgs/Point'
 CONTRACT = {
@@ -137,7 +139,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     copy = tmp_path_factory.mktemp('source') / 'hand_pose_ros'
     for folder in ('hand_pose_ros', 'msg', 'scripts', 'config', 'launch', 'rviz'):
         if (CHECKOUT / folder).is_dir():
-            shutil.copytree(CHECKOUT / folder, copy / folder, ignore=shutil.ignore_patterns('__pycache__'))
+            shutil.copytree(CHECKOUT / folder, copy / folder)
     for path in CHECKOUT.iterdir():
         if path.is_file():
             shutil.copy2(path, copy)
@@ -175,15 +177,16 @@ assert deserialize_message(serialize_message(message), type(message)) == message
     for name in ('estimator', 'evaluate', 'replay'):  # what `ros2 run hand_pose_ros NAME` starts
         program = prefix / 'lib/hand_pose_ros' / name
         assert os.access(program, os.X_OK), program
-    help_text = run(prefix / 'lib/hand_pose_ros/evaluate', '--help', cwd=prefix, **environment)
-    assert 'usage: hand-pose evaluate' in help_text
+        assert f'usage: hand-pose {name}' in run(program, '--help', cwd=prefix, **environment)
 
 
 def test_wheel_with_messages(source: Path, tmp_path: Path) -> None:
     pytest.importorskip('hand_pose_ros.msg', reason='the messages are not built: no ROS here')
     wheel = build_wheel(source, tmp_path)
     assert 'linux_x86_64' in wheel.name
-    assert set(MODULES) <= set(zipfile.ZipFile(wheel).namelist())
+    names = zipfile.ZipFile(wheel).namelist()
+    assert set(FILES) <= set(names)
+    assert not [name for name in names if '__pycache__' in name]
     prefix = tmp_path / 'prefix'
     run(sys.executable, '-m', 'pip', 'install', '-q', '--no-deps', '--ignore-installed', '--prefix', prefix, wheel,
         cwd=tmp_path)
@@ -197,7 +200,7 @@ def test_pure_wheel_beside_a_ros_that_is_not_from_wheels(source: Path, tmp_path:
     wheel = build_wheel(source, tmp_path, AMENT_PREFIX_PATH=str(tmp_path / 'opt/ros'))
     assert wheel.name.endswith('-py3-none-any.whl')
     names = zipfile.ZipFile(wheel).namelist()
-    assert set(MODULES) <= set(names)
+    assert set(FILES) <= set(names)
     assert not [name for name in names if name.endswith('.so') or name.startswith('hand_pose_ros/msg')]
     shipped = {name.partition('/data/share/hand_pose_ros/')[2] for name in names}
     assert {'package.xml', 'config/fastdds_large_images.xml', *(f'msg/{name}.msg' for name in CONTRACT)} <= shipped

@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from tqdm import tqdm
 
 from hand_pose_ros.errors import HandPoseError, InputError
@@ -69,6 +70,8 @@ def add_parser(subparsers: Any) -> None:
     bags.add_argument('--depth-scale', type=float, metavar='M', help='metres per unit of 16-bit depth (0.001)')
     bags.add_argument('--out-bag', metavar='BAG', help='write /hand/joints there, to be played beside the original; '
                       'with several bags a folder')
+    bags.add_argument('--via-ros', action='store_true', help='play the bag through the live node at its pace, and '
+                      'report the images it dropped and the latency from image to joints')
     bags.add_argument('--jobs', type=int, metavar='N', help='bags at the same time (default: one per core)')
 
 
@@ -104,17 +107,57 @@ def _run_bag(args: argparse.Namespace) -> int:
     from hand_pose_ros.evaluation.bag_evaluation import evaluate_bag, read_depths
 
     settings = _settings(args)
-    result = evaluate_bag(args.bags[0], settings, progress=_progress('frames'), hands_bag=args.out_bag)
+    result = _evaluate_live(args, settings) if args.via_ros else \
+        evaluate_bag(args.bags[0], settings, progress=_progress('frames'), hands_bag=args.out_bag)
     others = [published.load_result(source) for source in args.compare]
     _deliver(args, result, others, lambda rows: read_depths(args.bags[0], rows, settings))
     return int(result.info['damaged'])
 
 
+def _evaluate_live(args: argparse.Namespace, settings: Settings) -> Result:
+    """What the live node answers to a bag; images without an answer count as images without a hand."""
+    if args.out_bag:
+        args.error('--out-bag does not work with --via-ros: record /hand/joints instead')
+    from hand_pose_ros.bags import DepthBag
+    from hand_pose_ros.evaluation.ground_truth import with_truth
+    from hand_pose_ros.skeleton import get_skeleton
+    try:
+        from hand_pose_ros.ros.live import play_through_node
+    except ImportError as error:
+        raise HandPoseError(f'--via-ros needs ROS 2, rclpy and the messages of this package ({error})') from error
+
+    parameters = {'model': args.model, 'device': args.device, 'side': args.side, 'cube_size': args.cube_size,
+                  'min_score': args.min_score, 'depth_scale': args.depth_scale}
+    if args.intrinsics:
+        parameters |= {f'intrinsics.{name}': value for name, value in zip(('fx', 'fy', 'cx', 'cy'), args.intrinsics,
+                                                                          strict=True)}
+    with DepthBag(args.bags[0], **settings.bag) as bag:
+        intrinsics = next(iter(bag)).intrinsics
+        stamps = [frame.stamp_ns for frame in bag]
+        answers = play_through_node(bag, args.camera_info_topic,
+                                    {name: value for name, value in parameters.items() if value is not None})
+        topic = bag.depth_topic
+    skeleton = get_skeleton(answers.skeleton)
+    joints = np.full((len(stamps), len(skeleton), 3), np.nan)
+    for row, stamp in enumerate(stamps):
+        if stamp in answers.hands and answers.hands[stamp].hands:
+            joints[row] = [(point.x, point.y, point.z) for point in answers.hands[stamp].hands[0].joints]
+    latency = np.array([answers.latency_s.get(stamp, np.nan) for stamp in stamps])
+    dropped = sum(stamp not in answers.hands for stamp in stamps)
+    notes = (f'{dropped} of {len(stamps)} images got no answer from the node and count as images without a hand.',)
+    result = Result(
+        Path(args.bags[0]).stem, skeleton, intrinsics, joints, stamps_ns=np.array(stamps),
+        seconds={'image to joints': latency}, notes=notes if dropped else (), info={
+            'bag': args.bags[0], 'depth_topic': topic, 'model': args.model or 'default', 'device': args.device,
+            'via_ros': True, 'dropped': dropped, 'damaged': False})
+    return with_truth(result, args.ground_truth, args.bags[0]) if args.ground_truth else result
+
+
 def _run_bags(args: argparse.Namespace) -> int:
     from hand_pose_ros.evaluation.bag_evaluation import evaluate_bags, read_depths
 
-    if args.compare:
-        args.error('--compare works with one bag, not with several')
+    if args.compare or args.via_ros:
+        args.error('--compare and --via-ros work with one bag, not with several')
     settings, names = _settings(args), _names(args.bags)
     hands_bags = {bag: Path(args.out_bag) / f'{names[bag]}.mcap' for bag in args.bags} if args.out_bag else {}
     outcomes = evaluate_bags(args.bags, settings, args.jobs, _progress('bags'), hands_bags)
@@ -185,11 +228,15 @@ def print_summaries(summaries: Iterable[tuple[str, dict[str, Any]]]) -> None:
         if 'latency_ms' not in summary:
             continue
         print(f'{name}: {summary["frames_total"]} frames, {number(summary["detection_rate"], 1, " %", 100)} with a '
-              f'hand, {summary["frames_per_s"]} frames/s, jitter {number(summary["jitter_mm"], 2, " mm")}, '
+              f'hand, {_pace(summary)}, jitter {number(summary["jitter_mm"], 2, " mm")}, '
               f'bone drift {number(summary["bone_drift_mm"], 2, " mm")}')
         keys = ('mean', 'p50', 'p90', 'p99', 'max')
         print(text_table(('ms', *keys), [(stage, *(number(row.get(key), 3) for key in keys))
                                          for stage, row in summary['latency_ms'].items()]))
+
+
+def _pace(summary: dict[str, Any]) -> str:
+    return f'{summary["dropped"]} dropped' if 'dropped' in summary else f'{summary["frames_per_s"]} frames/s'
 
 
 def _progress(unit: str) -> Callable[[Iterable[Any], int], Iterable[Any]]:

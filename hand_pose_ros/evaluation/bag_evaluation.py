@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from hand_pose_ros.bags import BagWriter, DepthBag, Frame
 from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.estimator import HandEstimate, HandPoseEstimator
-from hand_pose_ros.evaluation.ground_truth import read_truth
+from hand_pose_ros.evaluation.ground_truth import with_truth
 from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.geometry import Intrinsics
 
@@ -38,7 +38,7 @@ class Settings:
         num_threads: of the network on the CPU; None chooses.
         estimator: further arguments of HandPoseEstimator.
         bag: arguments of DepthBag beside the path.
-        ground_truth: a file or a topic, see `ground_truth.read_truth`.
+        ground_truth: a file or a topic, see `ground_truth.with_truth`.
     """
 
     model: str | None = None
@@ -96,11 +96,7 @@ def evaluate_bag(path: str | Path, settings: Settings, progress: Progress | None
         seconds={stage: np.array(record.seconds[stage]) for stage in sorted(record.seconds, key=_stage_order)},
         info={'bag': str(path), 'depth_topic': bag.depth_topic, 'model': str(settings.model or 'default'),
               'device': settings.device, 'frames_per_s': round(rate, 1), 'damaged': damaged})
-    if settings.ground_truth is None:
-        return result
-    truth, note = read_truth(settings.ground_truth, path, result)
-    return replace(result, truth=truth, notes=(*notes, *note),
-                   info={**result.info, 'ground_truth': settings.ground_truth})
+    return result if settings.ground_truth is None else with_truth(result, settings.ground_truth, path)
 
 
 def evaluate_bags(paths: Sequence[str | Path], settings: Settings, jobs: int | None = None,

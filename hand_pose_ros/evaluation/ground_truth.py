@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -19,15 +20,13 @@ TOLERANCE_NS = 10_000_000
 Joints = NDArray[np.float64]
 
 
-def read_truth(source: str, bag: str | Path, result: Result) -> tuple[Joints, tuple[str, ...]]:
-    """The true joints (N, J, 3) of the N images of a result, in metres, NaN where there is no label; and notes.
+def with_truth(result: Result, source: str, bag: str | Path) -> Result:
+    """The result of N images of a bag, with the true joints; images without a label get a note.
 
     Args:
         source: a topic of the bag with HandJointsArray, one hand a message; an .npz file with `joints` (M, J, 3) in
             metres and, if M is not N, `stamps_ns` (M,); or a text file with `u v d` per joint and a line for each
             image, see `published`.
-        bag: that the images come from.
-        result: whose stamps, skeleton and intrinsics are taken.
 
     Raises:
         InputError: there is no such source, or it does not fit the images.
@@ -41,8 +40,12 @@ def read_truth(source: str, bag: str | Path, result: Result) -> tuple[Joints, tu
         if len(joints) != len(result.predictions):
             raise InputError(f'{source}: {len(joints)} labels for {len(result.predictions)} images: give one for each '
                              'image, or an .npz file with stamps_ns')
-        return joints, ()
-    return _match(stamps, joints, result, source)
+        truth = joints
+    else:
+        truth = _match(stamps, joints, result, source)
+    missing = int(np.isnan(truth).all((1, 2)).sum())
+    notes = (f'{missing} of {len(truth)} images have no label in {source} and are not scored.',) if missing else ()
+    return replace(result, truth=truth, notes=(*result.notes, *notes), info={**result.info, 'ground_truth': source})
 
 
 def _read(source: str, bag: str | Path, result: Result) -> tuple[NDArray[np.int64] | None, Joints]:
@@ -71,7 +74,8 @@ def _read_topic(topic: str, bag: str | Path) -> tuple[NDArray[np.int64], Joints]
             np.stack([message.joints[0] for message in messages]).astype(np.float64))
 
 
-def _match(stamps: NDArray[np.int64], joints: Joints, result: Result, source: str) -> tuple[Joints, tuple[str, ...]]:
+def _match(stamps: NDArray[np.int64], joints: Joints, result: Result, source: str) -> Joints:
+    """For each image the label with the nearest stamp; NaN (J, 3) if none is near enough."""
     assert result.stamps_ns is not None
     order = np.argsort(stamps, kind='stable')
     stamps, joints = stamps[order], joints[order]
@@ -85,5 +89,4 @@ def _match(stamps: NDArray[np.int64], joints: Joints, result: Result, source: st
                          f'{distances.min() / 1e9:.3f} s away; are the stamps of the same clock?')
     truth = np.full((len(near), *joints.shape[1:]), np.nan)
     truth[near] = joints[nearest[near]]
-    missing = int((~near).sum())
-    return truth, (f'{missing} of {len(near)} images have no label in {source} and are not scored.',) if missing else ()
+    return truth

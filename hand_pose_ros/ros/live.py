@@ -1,0 +1,166 @@
+"""Play a bag through the real node, in a process of its own and over DDS, and record what it answers and when."""
+
+from __future__ import annotations
+
+import os
+import signal
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import CompressedImage, Image
+
+from hand_pose_ros.bags import DepthBag
+from hand_pose_ros.errors import HandPoseError
+from hand_pose_ros.msg import HandJointsArray, HandSkeleton
+from hand_pose_ros.ros import qos
+from hand_pose_ros.ros.conversions import stamp_ns
+from hand_pose_ros.ros.replay import Replay
+from hand_pose_ros.ros.topics import CAMERA_INFO, IMAGE
+
+START_TIMEOUT_S = 60.0
+"""The node must be up after so long; loading the network takes most of it."""
+QUIET_S = 2.0
+"""An answer that has not come so long after the last one will not come."""
+TRANSPORTS = ('compressedDepth', 'compressed')
+
+
+@dataclass(frozen=True)
+class Answers:
+    """What the node said. Images and answers belong together by their stamp in ns.
+
+    Attributes:
+        skeleton: name of the joint set.
+        hands: stamp -> the answer.
+        latency_s: stamp -> from the arrival of the image at a subscriber to that of the answer at the same one.
+    """
+
+    skeleton: str
+    hands: dict[int, HandJointsArray]
+    latency_s: dict[int, float]
+
+
+def play_through_node(bag: DepthBag, camera_info_topic: str | None = None,
+                      parameters: Mapping[str, Any] | None = None) -> Answers:
+    """Start the node `estimator` in a namespace of its own, play the depth images at their pace, and stop the node.
+
+    Args:
+        camera_info_topic: if it is not beside the depth topic.
+        parameters: of the node.
+
+    Raises:
+        HandPoseError: the node does not come up, or dies.
+        InputError: the bag cannot be played.
+    """
+    namespace = f'/evaluation_{os.getpid()}'
+    base, _, transport = bag.depth_topic.rpartition('/')
+    image, transport = (base, transport) if transport in TRANSPORTS else (bag.depth_topic, 'raw')
+    beside = f'{image.rpartition("/")[0]}/camera_info'
+    infos = {camera_info_topic or beside} & {connection.topic for connection in bag.connections}
+    arguments = [item for name, value in {'transport': transport, **(parameters or {})}.items()
+                 for item in ('-p', f'{name}:={value}')]
+    remappings = {'__ns': namespace, IMAGE: image, CAMERA_INFO: camera_info_topic or beside}
+    arguments += [item for name, topic in remappings.items() for item in ('-r', f'{name}:={topic}')]
+    if ours := not rclpy.ok():
+        rclpy.init()
+    try:
+        with _listening(namespace, bag.depth_topic, Image if transport == 'raw' else CompressedImage) as listener, \
+                _running(arguments) as process:
+            _wait_until(lambda: bool(listener.skeleton), process, START_TIMEOUT_S)
+            replay = Replay(bag, topics={bag.depth_topic, *infos}, reliability='reliable')
+            try:
+                replay.wait_for_subscribers(START_TIMEOUT_S)
+                replay.play()
+            finally:
+                replay.close()
+            listener.wait_until_quiet()
+            if process.poll() is not None:
+                raise HandPoseError(f'the node died with exit code {process.returncode}: its last words are above')
+        answers, seen = listener.answers, listener.seen
+        return Answers(listener.skeleton, {stamp: hands for stamp, (_, hands) in answers.items()},
+                       {stamp: at - seen[stamp] for stamp, (at, _) in answers.items() if stamp in seen})
+    finally:
+        if ours:
+            rclpy.try_shutdown()
+
+
+class _Listener:
+    """Notes when each image and each answer arrives."""
+
+    def __init__(self, namespace: str, depth_topic: str, image_type: type) -> None:
+        self.node = rclpy.create_node('listener', namespace=namespace)
+        self.skeleton = ''
+        self.seen: dict[int, float] = {}
+        self.answers: dict[int, tuple[float, HandJointsArray]] = {}
+        # Serialized, for unpacking large images here would slow down what is measured.
+        self.node.create_subscription(image_type, depth_topic, self._on_image, QoSProfile(depth=10), raw=True)
+        self.node.create_subscription(HandJointsArray, 'hand/joints', self._on_answer, QoSProfile(depth=100))
+        self.node.create_subscription(HandSkeleton, 'hand/skeleton', self._on_skeleton, qos.LATCHED)
+
+    def wait_until_quiet(self) -> None:
+        """Wait until all images are answered, or no answer has come for a while."""
+        changed, count = time.monotonic(), -1
+        while len(self.answers) < len(self.seen) and time.monotonic() - changed < QUIET_S:
+            if len(self.answers) != count:
+                changed, count = time.monotonic(), len(self.answers)
+            time.sleep(0.05)
+
+    def _on_image(self, data: bytes) -> None:
+        # A header, which begins with its stamp, is the first field behind the 4 bytes that tell the byte order.
+        sec, nanosec = struct.unpack_from('<iI' if data[1] & 1 else '>iI', data, 4)
+        self.seen.setdefault(sec * 1_000_000_000 + nanosec, time.monotonic())
+
+    def _on_answer(self, hands: HandJointsArray) -> None:
+        self.answers[stamp_ns(hands.header)] = time.monotonic(), hands
+
+    def _on_skeleton(self, skeleton: HandSkeleton) -> None:
+        self.skeleton = skeleton.name
+
+
+@contextmanager
+def _listening(namespace: str, depth_topic: str, image_type: type) -> Iterator[_Listener]:
+    listener, executor = _Listener(namespace, depth_topic, image_type), SingleThreadedExecutor()
+    executor.add_node(listener.node)
+    thread = threading.Thread(target=executor.spin, daemon=True)
+    thread.start()
+    try:
+        yield listener
+    finally:
+        executor.shutdown()
+        thread.join(timeout=5)
+        listener.node.destroy_node()
+
+
+@contextmanager
+def _running(arguments: list[str]) -> Iterator[subprocess.Popen[bytes]]:
+    """The node in another process, which is stopped as Ctrl-C does."""
+    code = 'import sys; from hand_pose_ros.cli import main; sys.exit(main())'
+    process = subprocess.Popen([sys.executable, '-c', code, 'estimator', '--ros-args', *arguments])
+    try:
+        yield process
+    finally:
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait(timeout=10)
+        except subprocess.TimeoutExpired:
+            process.kill()
+
+
+def _wait_until(done: Callable[[], bool], process: subprocess.Popen[bytes], timeout_s: float) -> None:
+    start = time.monotonic()
+    while not done():
+        if process.poll() is not None:
+            raise HandPoseError(f'the node ended with exit code {process.returncode} before it was ready: '
+                                'its last words are above')
+        if time.monotonic() - start > timeout_s:
+            raise HandPoseError(f'the node was not ready after {timeout_s:.0f} s: does `hand-pose estimator` start?')
+        time.sleep(0.05)

@@ -1,0 +1,217 @@
+"""Published results: the numbers of the field come out exactly, and files that do not fit are refused with a reason."""
+
+import gzip
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from hand_pose_ros.cli import main
+from hand_pose_ros.errors import InputError
+from hand_pose_ros.evaluation import tompson
+from hand_pose_ros.evaluation.published import DATASETS, load_published, load_result, read_text
+from hand_pose_ros.evaluation.results import Result
+from hand_pose_ros.geometry import Intrinsics
+from hand_pose_ros.skeleton import SKELETONS
+
+NYU, ICVL = DATASETS['nyu'], DATASETS['icvl']
+
+# mean, median, max, mean of the worst joints in mm; frames within 20, 30, 40, 50, 80 mm in per cent.
+KNOWN = {
+    'nyu/DeepPrior': (20.750, 14.854, 169.0, 44.781, 16.27, 36.22, 49.24, 62.08, 91.19),
+    'nyu/DeepPrior-ORRef': (19.726, 12.882, 194.4, 44.708, 23.65, 39.57, 52.02, 62.60, 88.15),
+    'nyu/DeepModel': (17.036, 12.209, 147.9, 39.576, 18.97, 41.93, 58.20, 71.78, 95.07),
+    'nyu/DeepPriorPP': (12.238, 9.031, 135.5, 26.544, 44.72, 70.31, 83.53, 90.97, 97.95),
+    'icvl/LRF': (12.578, 9.561, 106.1, 33.736, 20.74, 50.38, 70.86, 85.78, 97.49),
+    'icvl/DeepPrior': (10.427, 8.152, 89.2, 24.005, 47.44, 72.93, 87.61, 94.30, 99.00),
+    'icvl/DeepPrior-ORRef': (9.426, 7.572, 89.1, 22.217, 57.69, 79.34, 90.46, 94.87, 98.58),
+}
+SUBJECTS = {'nyu/DeepPrior': (12.067, 24.395), 'nyu/DeepPrior-ORRef': (10.201, 23.724),
+            'nyu/DeepModel': (10.154, 19.925), 'nyu/DeepPriorPP': (6.930, 14.467), 'icvl/LRF': (12.629, 12.537)}
+
+
+@pytest.mark.parametrize('name', KNOWN)
+def test_published_results_give_the_published_numbers(shared_data, tmp_path, name, capsys):
+    folder, dataset = shared_data / 'published', name.split('/')[0]
+    code = main(['evaluate', '--predictions', str(folder / f'{name}.txt.gz'), '--dataset', dataset,
+                 '--ground-truth', str(folder / dataset / 'groundtruth.txt.gz'), '--json', str(tmp_path / 'r.json')])
+    assert code == 0
+    got = json.loads((tmp_path / 'r.json').read_text())
+    mean, median, largest, worst, *within = KNOWN[name]
+    assert got['mean_mm'] == pytest.approx(mean, abs=6e-4) and got['median_mm'] == pytest.approx(median, abs=6e-4)
+    assert got['max_mm'] == pytest.approx(largest, abs=0.06) and got['mean_worst_mm'] == pytest.approx(worst, abs=6e-4)
+    assert [100 * got['within_mm'][d] for d in ('20', '30', '40', '50', '80')] == pytest.approx(within, abs=6e-3)
+    parts = [part['mean_mm'] for part in got.get('parts', {}).values()]
+    assert parts == pytest.approx(list(SUBJECTS.get(name, ())), abs=6e-4)
+    assert set(got['per_joint_mm']) == set(DATASETS[dataset].skeleton.joint_names)
+    assert f'{mean:.3f}' in capsys.readouterr().out
+
+
+def test_other_intrinsics_shift_the_mean_as_they_should(shared_data, tmp_path):
+    folder = shared_data / 'published' / 'icvl'
+    assert main(['evaluate', '--predictions', str(folder / 'LRF.txt.gz'), '--dataset', 'icvl', '--ground-truth',
+                 str(folder / 'groundtruth.txt.gz'), '--intrinsics', '241.42', '241.42', '160', '120',
+                 '--json', str(tmp_path / 'r.json')]) == 0
+    assert json.loads((tmp_path / 'r.json').read_text())['mean_mm'] == pytest.approx(12.564, abs=6e-4)
+
+
+def test_a_file_of_one_sequence_is_matched_to_it_and_says_so(shared_data, capsys):
+    folder = shared_data / 'published' / 'icvl'
+    whole = load_published(folder / 'DeepPrior.txt.gz', folder / 'groundtruth.txt.gz', ICVL)
+    assert len(whole.predictions) == 702 and 'sequence 1' in whole.notes[0] and '894' in whole.notes[0]
+    main(['evaluate', '--predictions', str(folder / 'DeepPrior.txt.gz'), '--dataset', 'icvl',
+          '--ground-truth', str(folder / 'groundtruth.txt.gz')])
+    assert 'NOTE: DeepPrior.txt.gz has 702 frames, as many as sequence 1' in capsys.readouterr().err
+    exact = load_published(folder / 'DeepPrior.txt.gz', folder / 'test_seq_1.txt.gz', ICVL)
+    assert not exact.notes and np.array_equal(exact.truth, whole.truth)
+    second = load_published(folder / 'LRF.txt.gz', folder / 'test_seq_2.txt.gz', ICVL)
+    assert second.summary()['mean_mm'] == pytest.approx(12.537, abs=6e-4), 'the truth may be the shorter one'
+    with pytest.raises(InputError, match=r'702 frames but .* 894'):
+        load_published(folder / 'DeepPrior.txt.gz', folder / 'test_seq_2.txt.gz', ICVL)
+
+
+def write_uvd(path, uvd, names=None):
+    lines = [' '.join(f'{x:.3f}' for x in frame.ravel()) for frame in uvd]
+    text = '\n'.join(f'{name} {line}' for name, line in zip(names, lines, strict=True)) if names else '\n'.join(lines)
+    path.write_bytes(gzip.compress(text.encode()) if path.suffix == '.gz' else text.encode())
+    return path
+
+
+@pytest.fixture
+def uvd():
+    rng = np.random.default_rng(0)
+    return np.concatenate([rng.uniform(100, 300, (5, 14, 2)), rng.uniform(400, 900, (5, 14, 1))], axis=-1)
+
+
+@pytest.mark.parametrize('suffix', ['.txt', '.txt.gz'])
+@pytest.mark.parametrize('named', [False, True])
+def test_text_files_are_read_in_every_form(tmp_path, uvd, suffix, named):
+    names = [f'seq/image_{k}.png' for k in range(5)] if named else None
+    labels = read_text(write_uvd(tmp_path / f'p{suffix}', uvd, names), NYU.skeleton)
+    assert labels.uvd == pytest.approx(uvd, abs=1e-3) and labels.names == tuple(names or ())
+    points = labels.points(NYU.intrinsics)
+    assert NYU.intrinsics.project(points) == pytest.approx(uvd[..., :2], abs=1e-3)
+    assert points[..., 2] == pytest.approx(uvd[..., 2] / 1000, abs=1e-6)
+
+
+def test_nan_and_zero_joints_are_missing(tmp_path, uvd):
+    broken = uvd.copy()
+    broken[0, 3], broken[1, 0, 0], broken[2] = 0, np.nan, np.nan
+    result = load_published(write_uvd(tmp_path / 'p.txt', broken), write_uvd(tmp_path / 'g.txt', uvd), NYU)
+    summary = result.summary()
+    assert (summary['missed_frames'], summary['missed_joints'], summary['frames']) == (1, 16, 5)
+    assert summary['mean_mm'] == pytest.approx(0, abs=1e-6), 'what was predicted is right'
+    assert summary['within_mm']['80'] == pytest.approx(2 / 5) and summary['detection_rate'] == pytest.approx(4 / 5)
+
+
+def test_names_on_both_sides_decide_what_belongs_together(tmp_path, uvd):
+    names = [f'{k}.png' for k in range(5)]
+    truth = write_uvd(tmp_path / 'g.txt', uvd, names)
+    shuffled = write_uvd(tmp_path / 'p.txt', uvd[[3, 0]], ['3.png', '0.png'])
+    result = load_published(shuffled, truth, NYU)
+    assert result.summary()['max_mm'] == pytest.approx(0, abs=1e-6) and '2 of the 5 frames' in result.notes[0]
+    with pytest.raises(InputError, match=r"'9\.png' is not in"):
+        load_published(write_uvd(tmp_path / 'q.txt', uvd[:1], ['9.png']), truth, NYU)
+    with pytest.raises(InputError, match=r"'1\.png' stands on two lines"):
+        load_published(write_uvd(tmp_path / 'q.txt', uvd[:2], ['1.png'] * 2), truth, NYU)
+
+
+@pytest.mark.parametrize(('change', 'message'), [
+    (lambda lines: [lines[0], f'1 {lines[1]}', *lines[2:]], 'line 2 has 43 numbers, but the 14 joints of nyu14'),
+    (lambda lines: [lines[0], lines[1].replace(' ', ' 1,5 ', 1), *lines[2:]], 'line 2 has 43 numbers'),
+    (lambda lines: [*lines[:4], lines[4].rpartition(' ')[0] + ' 1,5'], "line 5 has '1,5' where a number belongs"),
+    (lambda lines: ['', ''], 'no line with joints'),
+    (lambda lines: [f'a.png {lines[0]}', *lines[1:]], '1 of 5 lines begin with a file name'),
+])
+def test_bad_lines_are_named(tmp_path, uvd, change, message):
+    path = write_uvd(tmp_path / 'p.txt', uvd)
+    path.write_text('\n'.join(change(path.read_text().splitlines())))
+    with pytest.raises(InputError, match=message):
+        read_text(path, NYU.skeleton)
+
+
+def test_wrong_counts_joints_and_units_are_refused(tmp_path, uvd, capsys):
+    truth = write_uvd(tmp_path / 'g.txt', uvd)
+    with pytest.raises(InputError, match=r'4 frames but .* has 5.*2440 \(subject 1\)'):
+        load_published(write_uvd(tmp_path / 'p.txt', uvd[:4]), truth, NYU)
+    with pytest.raises(InputError, match='line 1 has 42 numbers, but the 16 joints of icvl16'):
+        read_text(truth, ICVL.skeleton)
+    with pytest.raises(InputError, match='looks like metres'):
+        read_text(write_uvd(tmp_path / 'm.txt', uvd / [1, 1, 1000]), NYU.skeleton)
+    (tmp_path / 'cut.txt.gz').write_bytes(gzip.compress(truth.read_bytes())[:-20])
+    with pytest.raises(InputError, match='cut short'):
+        read_text(tmp_path / 'cut.txt.gz', NYU.skeleton)
+    arguments = ['evaluate', '--predictions', str(tmp_path / 'none.txt'), '--ground-truth', str(truth)]
+    assert main([*arguments, '--dataset', 'nyu']) == 1
+    assert 'none.txt' in capsys.readouterr().err
+    for wrong in ([], arguments, [*arguments, '--dataset', 'mano'], ['bag', *arguments]):
+        with pytest.raises(SystemExit) as caught:
+            main(['evaluate', *wrong[1:]])
+        assert caught.value.code == 2
+
+
+def test_nyu_frame_1_is_decoded_and_lies_before_its_joints(shared_data):
+    depth = tompson.read_nyu_depth(shared_data / 'frames' / 'nyu' / 'depth_1_0000001.png')
+    labels = read_text(shared_data / 'published' / 'nyu' / 'groundtruth.txt.gz', NYU.skeleton)
+    assert depth.shape == (480, 640) and depth[depth > 0].min() == pytest.approx(0.731) and depth.max() < 2
+    u, v, d = labels.uvd[0].T
+    in_front = d - 1000 * depth[np.rint(v).astype(int), np.rint(u).astype(int)]
+    assert in_front.min() > 2 and in_front.max() < 33, 'the skin lies before the joint'
+
+
+def test_tompson_protocol_on_the_frame_that_is_there(shared_data, tmp_path):
+    folder, results = shared_data / 'published' / 'nyu', {}
+    for protocol in ('paper', 'code'):
+        result = results[protocol] = tompson.load_tompson(
+            folder / 'Tompson_2d.npz', folder / 'groundtruth.txt.gz', shared_data / 'frames' / 'nyu', NYU, protocol)
+        assert result.summary()['frames'] == 1 and '1 of 8252 frames' in result.notes[1]
+    paper, code = results['paper'].errors_mm[0], results['code'].errors_mm[0]
+    beside = paper > 100  # two finger tips are read beside the hand
+    assert np.flatnonzero(beside).tolist() == [0, 6]
+    assert paper[~beside] == pytest.approx(code[~beside]) and code.max() < 30
+
+
+def test_lifting_a_hand_worked_case():
+    camera = Intrinsics(100, 100, 10, 10, 20, 20)
+    depth = np.zeros((20, 20), np.float32)
+    depth[10, 10], depth[10, 15], depth[5, 10] = 0.6, 0.9, 0.3  # the hand, the wall behind, something before
+    pixels = np.array([[10.4, 9.6], [15, 10], [10, 5], [2, 2], [500, 3]])
+    truth = np.array([0.61, 0.62, 0.63, 0.64, 0.65])
+    paper = tompson.lift(pixels, depth, camera, 0.65, 0.3, truth, 'paper')
+    assert paper[:, 2] == pytest.approx([0.6, 0.8, 0.8, 0.8, 0.8]), 'the back face of the cube is at 0.8 m'
+    code = tompson.lift(pixels, depth, camera, 0.65, 0.3, truth, 'code')
+    assert code[:, 2] == pytest.approx([0.6, 0.62, 0.63, 0.64, 0.65])
+    assert camera.project(paper) == pytest.approx(pixels)
+
+
+def test_nyu_depth_is_written_in_green_and_blue(tmp_path):
+    picture = np.zeros((2, 2, 3), np.uint8)
+    picture[0, 0] = 0x21, 0x03, 0  # B, G, R: 0x0321 = 801 mm
+    picture[0, 1] = 0xD1, 0x07, 0  # 2001: no data
+    cv2.imwrite(str(tmp_path / 'depth_1_0000002.png'), picture)
+    depths = tompson.read_nyu_depths(tmp_path, [0, 1])
+    assert list(depths) == [1] and depths[1] == pytest.approx(np.array([[0.801, 0], [0, 0]]))
+    cv2.imwrite(str(tmp_path / 'grey.png'), np.ones((4, 4), np.uint16))
+    with pytest.raises(InputError, match='not a depth frame of NYU'):
+        tompson.read_nyu_depth(tmp_path / 'grey.png')
+
+
+def test_results_are_kept_with_all_that_belongs_to_them(tmp_path):
+    rng = np.random.default_rng(4)
+    result = Result(
+        'a result', SKELETONS['hand21'], Intrinsics(400, 401, 160, 120, 320, 240), rng.normal(size=(3, 21, 3)),
+        rng.normal(size=(3, 21, 3)), np.array([1, 2, 3]), {'detect': rng.random(3)}, {'part': (0, 2)}, ('a note',),
+        {'model': 'x'})
+    result.save(tmp_path / 'r.npz')
+    again = load_result(f'renamed={tmp_path / "r.npz"}')
+    assert again.name == 'renamed' and again.summary() | {'name': ''} == result.summary() | {'name': ''}
+    assert np.array_equal(again.predictions, result.predictions) and again.skeleton == result.skeleton
+    assert [file.name for file in tmp_path.iterdir()] == ['r.npz'], 'no temporary file is left'
+    np.savez(tmp_path / 'other.npz', joints=np.zeros(3))
+    (tmp_path / 'broken.npz').write_bytes((tmp_path / 'r.npz').read_bytes()[:300])
+    for name in ('other.npz', 'broken.npz'):
+        with pytest.raises(InputError, match=f'{name}: not a result'):
+            Result.load(tmp_path / name)
+    with pytest.raises(InputError, match=r'none\.npz: the file cannot be read'):
+        Result.load(tmp_path / 'none.npz')

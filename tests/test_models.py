@@ -1,0 +1,301 @@
+"""The networks have the published shapes, the prior is a principal component analysis, and each refiner and decoder
+does what its formula says."""
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from hand_pose_ros.errors import HandPoseError
+from hand_pose_ros.models import ARCHITECTURES, build
+from hand_pose_ros.models.dense import cells, decode, encode
+from hand_pose_ros.models.prior import fit_prior
+from hand_pose_ros.models.refiner import Refiner
+
+POSE_NETWORKS = ("shallow", "deep", "deep_prior", "multi_scale", "resnet", "hand_dense")
+REFINERS = ("std_ref", "or_ref")
+
+
+@pytest.fixture(autouse=True)
+def _seed() -> None:
+    torch.manual_seed(0)
+    torch.set_num_threads(1)
+
+
+def parameters(network: nn.Module) -> int:
+    return sum(p.numel() for p in network.parameters())
+
+
+def hand_patches(count: int) -> torch.Tensor:
+    """Patches with a sloping disc, like a palm, before the background."""
+    y, x = torch.meshgrid(*[torch.linspace(-1, 1, 128)] * 2, indexing="ij")
+    centers, slopes = torch.rand(count, 2, 1, 1) * 0.4 - 0.2, torch.rand(count, 2, 1, 1) - 0.5
+    inside = (x - centers[:, 0]) ** 2 + (y - centers[:, 1]) ** 2 < 0.4
+    depth = slopes[:, 0] * x + slopes[:, 1] * y + 0.02 * torch.rand(count, 128, 128)
+    return torch.where(inside, depth, torch.ones(())).clamp(-1, 1)[:, None]
+
+
+# Deep, with and without the prior: (joints, direct, prior), counted from the layers of the original network.
+@pytest.mark.parametrize(("joints", "direct", "prior"), [
+    (14, 2_087_306, 2_076_308), (16, 2_093_456, 2_076_494), (21, 2_108_831, 2_076_959)])
+def test_deep_has_the_original_number_of_parameters(joints, direct, prior):
+    assert parameters(build("deep", joints=joints)) == direct
+    assert parameters(build("deep", joints=joints, bottleneck=30)) == prior
+    assert parameters(build("deep_prior", joints=joints)) == prior
+
+
+def test_the_other_networks_have_the_original_number_of_parameters():
+    assert parameters(build("center_refiner")) == 3_567_651
+    # The same branches with 63 outputs instead of 3.
+    assert parameters(build("multi_scale")) == 3_567_651 + 60 * 1025
+    as_built, as_meant = (parameters(build("resnet", joints=14, last_stride=stride)) for stride in (1, 2))
+    assert as_built == pytest.approx(18.71e6, abs=5e3)
+    assert as_meant == pytest.approx(6.2e6, abs=5e4)
+
+
+def test_layer_shapes_of_deep_and_multi_scale():
+    def shapes(module: nn.Module, patch: torch.Tensor) -> list[tuple[int, ...]]:
+        found: list[tuple[int, ...]] = []
+        hooks = [m.register_forward_hook(lambda _, __, out: found.append(tuple(out.shape[1:])))
+                 for m in module.modules() if isinstance(m, nn.ReLU) or isinstance(m, nn.Linear)]
+        module(patch)
+        for hook in hooks:
+            hook.remove()
+        return found
+
+    patch = torch.zeros(1, 1, 128, 128)
+    assert shapes(build("deep", bottleneck=30).features, patch) == [(8, 31, 31), (8, 13, 13), (8, 11, 11)]
+    assert shapes(build("multi_scale").features, patch) == [
+        (8, 31, 31), (8, 13, 13), (8, 11, 11), (8, 30, 30), (8, 13, 13), (8, 11, 11), (8, 14, 14), (8, 10, 10),
+        (8, 8, 8)]
+    assert shapes(build("deep", bottleneck=30).head, torch.zeros(1, 968)) == [
+        (1024,), (1024,), (1024,), (1024,), (30,), (63,)]
+
+
+def test_initialisation_follows_the_original():
+    network = build("deep_prior")
+    first, third = network.features[0][0], network.features[2][0]
+    assert first.weight.std().item() == pytest.approx((2 / 25) ** 0.5, rel=0.2)
+    assert third.weight.std().item() == pytest.approx((2 / 72) ** 0.5, rel=0.1)
+    assert network.head.hidden[0].weight.std().item() == pytest.approx(0.01, rel=0.01)
+    limit = (6 / (1024 + 30)) ** 0.5
+    assert 0.99 * limit < network.head.output.weight.abs().max().item() <= limit
+    assert all((p == 0).all() for name, p in network.named_parameters() if name.endswith("bias"))
+
+
+@pytest.mark.parametrize("architecture", POSE_NETWORKS)
+@pytest.mark.parametrize("joints", [14, 21])
+def test_every_pose_network_maps_patches_to_joints_and_learns(architecture, joints):
+    network = build(architecture, joints=joints)
+    patches = hand_patches(4)
+    answer = network(patches)
+    assert answer.shape == (4, joints, 3)
+    assert answer.isfinite().all()
+    answer.square().sum().backward()
+    moving = [p.grad is not None and bool(p.grad.abs().sum() > 0) for p in network.parameters()]
+    # hand_dense has a summary (confidence, side, ...) that the joints do not depend on.
+    assert sum(moving) >= len(moving) - (2 if architecture == "hand_dense" else 0)
+
+
+@pytest.mark.parametrize("architecture", ["shallow", "deep", "multi_scale", "resnet"])
+@pytest.mark.parametrize("bottleneck", [8, 30])
+def test_the_reconstruction_is_the_inverse_transform_of_the_prior_and_is_trained(architecture, bottleneck):
+    poses = np.random.default_rng(0).normal(size=(200, 63)) * 0.3
+    prior = fit_prior(poses, bottleneck)
+    network = build(architecture, bottleneck=bottleneck).eval()
+    network.set_prior(prior.mean, prior.components)
+    coefficients = torch.randn(5, bottleneck)
+    expected = prior.reconstruct(coefficients.numpy())
+    np.testing.assert_allclose(network.head.reconstruction(coefficients).detach(), expected, atol=1e-5)
+    # What the network says lies in the space of the prior.
+    pose = network(hand_patches(2)).detach().reshape(2, -1).numpy()
+    np.testing.assert_allclose(prior.reconstruct(prior.project(pose)), pose, atol=1e-4)
+    network(hand_patches(2)).sum().backward()
+    assert network.head.reconstruction.weight.grad.abs().sum() > 0
+
+
+def test_the_prior_equals_a_singular_value_decomposition():
+    rng = np.random.default_rng(1)
+    poses = rng.normal(size=(500, 12)) @ rng.normal(size=(12, 63)) + rng.normal(size=63)
+    prior = fit_prior(poses.reshape(500, 21, 3), 8)
+    _, singular, rows = np.linalg.svd(poses - poses.mean(0), full_matrices=False)
+    # An eigenvector is known up to its sign.
+    np.testing.assert_allclose(np.abs(np.sum(prior.components * rows[:8], axis=1)), 1, atol=1e-9)
+    np.testing.assert_allclose(prior.explained_variance_ratio, singular[:8] ** 2 / np.sum(singular ** 2), atol=1e-12)
+    np.testing.assert_allclose(prior.components @ prior.components.T, np.eye(8), atol=1e-12)
+    expected = (poses - poses.mean(0)) @ rows[:8].T @ rows[:8] + poses.mean(0)
+    np.testing.assert_allclose(prior.reconstruct(prior.project(poses)), expected, atol=1e-9)
+    # Twelve degrees of freedom need twelve components and no more.
+    full = fit_prior(poses, 12)
+    np.testing.assert_allclose(full.reconstruct(full.project(poses)), poses, atol=1e-9)
+
+
+def test_mistakes_are_named():
+    with pytest.raises(HandPoseError, match="choose one of .*deep"):
+        build("deeper")
+    with pytest.raises(HandPoseError, match="does not take depth: it takes joints"):
+        build("deep", depth=3)
+    with pytest.raises(HandPoseError, match="without a bottleneck"):
+        build("deep").set_prior(np.zeros(63), np.zeros((30, 63)))
+    with pytest.raises(HandPoseError, match="does not fit a bottleneck of 30 and 21 joints"):
+        build("deep_prior").set_prior(np.zeros(42), np.zeros((30, 42)))
+    with pytest.raises(HandPoseError, match="30 components need"):
+        fit_prior(np.zeros((10, 63)), 30)
+    with pytest.raises(HandPoseError, match="not finite"):
+        fit_prior(np.full((100, 63), np.nan), 30)
+
+
+def test_build_remembers_everything_that_made_the_network():
+    network = build("deep_prior", joints=14)
+    assert network.architecture == "deep_prior"
+    assert network.config == {"joints": 14, "bottleneck": 30, "dropout": 0.3}
+    assert set(POSE_NETWORKS) | set(REFINERS) | {"center_refiner"} == set(ARCHITECTURES)
+
+
+def test_the_center_refiner_sees_fine_the_middle_and_coarsely_the_rest():
+    network = build("center_refiner").eval()
+    patches = hand_patches(3)
+    palm = network(patches)
+    assert palm.shape == (3, 3)
+    corner = patches.clone()
+    corner[..., :8, :8] = -1
+    middle = patches.clone()
+    middle[..., 60:68, 60:68] = -1
+    with torch.no_grad():
+        branches = network.features.branches
+        for changed, seen in ((corner, [True, False, False]), (middle, [True, True, True])):
+            for branch, before, after, sees in zip(branches, network.features.views(patches),
+                                                   network.features.views(changed), seen, strict=True):
+                assert (branch(before) != branch(after)).any().item() is sees
+
+
+def awake(architecture: str) -> Refiner:
+    """A refiner whose offsets are as large as a trained one's: fresh weights move nothing."""
+    refiner = build(architecture).eval().requires_grad_(False)
+    for weight in refiner.weights:
+        weight.mul_(4)
+    return refiner
+
+
+@pytest.mark.parametrize("architecture", REFINERS)
+def test_all_joints_at_once_equal_joint_by_joint(architecture):
+    refiner = awake(architecture)
+    patches = hand_patches(3)
+    estimates = torch.rand(3, 21, 3) * 2.4 - 1.2  # some outside of the patch
+    together = refiner(patches, estimates)
+    assert (together - estimates).abs().max() > 0.05
+    alone = torch.stack([
+        torch.cat([refiner.for_joint(j)(patches[i:i + 1], estimates[i:i + 1, j:j + 1])[0] for j in range(21)])
+        for i in range(3)])
+    torch.testing.assert_close(together, alone, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("architecture", REFINERS)
+def test_one_joint_equals_plain_convolutions_over_a_sampled_window(architecture):
+    """The formula, written out once more with other means: grid_sample instead of indices, plain layers instead of
+    grouped ones."""
+    refiner, joint = awake(architecture), 7
+    patch = hand_patches(1)
+    estimate = torch.tensor([[[0.11, -0.23, 0.05]]]).repeat(1, 21, 1)
+
+    reach = refiner.window / 128
+    marked = torch.where(patch < 1, patch, torch.full_like(patch, 1e4))
+    depth = ((marked - estimate[0, joint, 2]) / reach).clamp(-1, 1)
+    line = (torch.arange(refiner.window) + 0.5) / refiner.window * 2 - 1
+    grid = torch.stack([line.expand(refiner.window, -1) * reach + estimate[0, joint, 0],
+                        line[:, None].expand(-1, refiner.window) * reach + estimate[0, joint, 1]], dim=-1)
+    window = F.grid_sample(depth, grid[None], mode="bilinear", padding_mode="border", align_corners=False)
+
+    features = []
+    for view, branch in zip(refiner.views, refiner.branches, strict=True):
+        border = (refiner.window - view) // 2
+        x = window[..., border:border + view, border:border + view]
+        for module in branch:
+            if isinstance(module, nn.Conv2d):
+                count = module.out_channels // 21
+                own = slice(joint * count, (joint + 1) * count)
+                x = F.conv2d(x, module.weight[own], module.bias[own])
+            else:
+                x = module(x)
+        features.append(x.flatten())
+    x = torch.cat(features)
+    for i, (weight, bias) in enumerate(zip(refiner.weights, refiner.biases, strict=True)):
+        x = x @ weight[joint] + bias[joint, 0]
+        x = F.relu(x) if i < len(refiner.weights) - 1 else x
+    expected = estimate[0, joint] + x * reach
+    torch.testing.assert_close(refiner(patch, estimate, iterations=1)[0, joint], expected, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("architecture", REFINERS)
+def test_the_refiner_iterates_from_its_own_answer(architecture):
+    refiner, patches, estimates = awake(architecture), hand_patches(2), torch.rand(2, 21, 3) - 0.5
+    once = refiner(patches, estimates, iterations=1)
+    torch.testing.assert_close(refiner(patches, estimates), refiner(patches, once, iterations=1))
+    torch.testing.assert_close(refiner(patches, estimates, iterations=0), estimates)
+
+
+@pytest.mark.parametrize("architecture", REFINERS)
+def test_the_refiner_follows_the_hand(architecture):
+    """What it adds depends on the surroundings of the joint alone: shift hand and estimate, and it stays the same."""
+    refiner, patch = awake(architecture), hand_patches(1)
+    moved = torch.roll(patch, (4, -6), dims=(2, 3))  # the disc is far from the border
+    moved = torch.where(moved < 1, moved + 0.1, moved)
+    estimate = torch.rand(1, 21, 3) * 0.4 - 0.2
+    shift = torch.tensor([-6 / 64, 4 / 64, 0.1])
+    before = refiner(patch, estimate, iterations=1) - estimate
+    after = refiner(moved, estimate + shift, iterations=1) - estimate - shift
+    torch.testing.assert_close(before, after, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("architecture", REFINERS)
+def test_each_joint_of_the_refiner_learns_from_its_own_error_only(architecture):
+    refiner = build(architecture)
+    answer = refiner(hand_patches(2), torch.zeros(2, 21, 3).requires_grad_())
+    answer[:, 3].square().sum().backward()
+    learns = refiner.weights[-1].grad.abs().sum(dim=(1, 2)) > 0
+    assert learns.tolist() == [j == 3 for j in range(21)]
+
+
+def test_orref_fits_in_twelve_megabytes_of_half_precision():
+    assert 2 * parameters(build("or_ref")) <= 12e6
+
+
+def test_an_untrained_refiner_moves_nothing_far():
+    for architecture in REFINERS:
+        estimates = torch.rand(2, 21, 3) - 0.5
+        answer = build(architecture).eval()(hand_patches(2), estimates)
+        assert (answer - estimates).abs().max() < 0.05
+
+
+def test_dense_maps_and_joints_are_inverse_to_each_other():
+    patches = hand_patches(3)
+    positions, seen = cells(patches)
+    # Joints as they are: a little under the visible surface.
+    rows, cols = torch.randint(12, 20, (2, 3, 21))
+    joints = positions[torch.arange(3)[:, None], :, rows, cols] + torch.tensor([0.02, -0.01, 0.1])
+    directions, closeness = encode(positions, joints)
+    again, agreement = decode(positions, seen, directions, closeness)
+    torch.testing.assert_close(again, joints, atol=1e-4, rtol=0)
+    assert (agreement > 0.8).all()
+
+
+def test_dense_cells_are_in_cube_units():
+    patch = torch.ones(1, 1, 128, 128)
+    patch[0, 0, 8:12, 120:124] = torch.tensor([-0.5, -0.5, 1, 1])  # half of the cell reads nothing
+    positions, seen = cells(patch)
+    # Columns 120 to 123 have their centre at (121.5 + 0.5) / 64 - 1.
+    torch.testing.assert_close(positions[0, :, 2, 30], torch.tensor([122 / 64 - 1, 10 / 64 - 1, -0.5]))
+    assert seen.sum() == 1
+    assert (positions[0, 2] == 1).sum() == 1023
+
+
+def test_dense_network_says_everything_and_survives_an_empty_patch():
+    network = build("hand_dense").eval()
+    patches = torch.cat([hand_patches(2), torch.ones(1, 1, 128, 128)])
+    answer = network.forward_full(patches)
+    assert {name: tuple(answer[name].shape) for name in network.outputs} == {
+        "joints": (3, 21, 3), "confidence": (3, 21), "hand": (3,), "side": (3,), "size": (3,)}
+    assert all(tensor.isfinite().all() for tensor in answer.values())
+    torch.testing.assert_close(network(patches), answer["joints"])
+    assert parameters(build("hand_dense", width=16)) < parameters(network) / 3

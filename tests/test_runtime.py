@@ -1,0 +1,173 @@
+"""Every engine gives the joints of plain PyTorch, for any number of hands, and leaves what it was given alone."""
+
+import functools
+import logging
+
+import numpy as np
+import pytest
+import torch
+
+from hand_pose_ros.errors import HandPoseError, InputError
+from hand_pose_ros.models import build
+from hand_pose_ros.runtime import default_threads, make_engine
+from hand_pose_ros.runtime.engine import Pipeline, TorchEngine
+
+MM_PER_UNIT = 150
+"""A cube of 0.30 m has 150 mm from its centre to a face."""
+ARCHITECTURES = ("shallow", "deep", "deep_prior", "multi_scale", "resnet", "hand_dense")
+
+
+def hand_patches(count: int, seed: int = 0) -> np.ndarray:
+    """Patches with a sloping noisy disc, like a palm, before the background."""
+    rng = np.random.default_rng(seed)
+    y, x = np.meshgrid(*[np.linspace(-1, 1, 128)] * 2, indexing="ij")
+    patches = np.ones((count, 1, 128, 128))
+    for patch in patches:
+        inside = (x - rng.uniform(-0.2, 0.2)) ** 2 + (y - rng.uniform(-0.2, 0.2)) ** 2 < 0.4
+        patch[0, inside] = (rng.uniform(-0.5, 0.5) * x + rng.normal(0, 0.02, x.shape))[inside]
+    return patches.astype(np.float32).clip(-1, 1)
+
+
+@functools.cache
+def trained(architecture: str) -> torch.nn.Module:
+    """A network that answers as a trained one does: normalised inside, joints inside the cube."""
+    torch.manual_seed(0)
+    options = {"last_stride": 2, "blocks": 2} if architecture == "resnet" else {}
+    network = build(architecture, **options).requires_grad_(False)
+    patches = torch.from_numpy(hand_patches(8))
+    for module in network.modules():
+        if isinstance(module, torch.nn.BatchNorm2d):
+            module.momentum = None  # the statistics are those of the next call
+    network(patches)
+    network.eval()
+    scale = network(patches).abs().max()
+    if architecture == "hand_dense":
+        network.maps.weight.mul_(20)
+    else:
+        for layer in (network.head.reconstruction or network.head.output,):
+            layer.weight.mul_(0.7 / scale)
+    return network
+
+
+def trained_refiner(architecture: str) -> torch.nn.Module:
+    torch.manual_seed(1)
+    refiner = build(architecture).eval().requires_grad_(False)
+    for weight in refiner.weights:
+        weight.mul_(3.5)
+    return refiner
+
+
+@pytest.mark.parametrize("architecture", ARCHITECTURES)
+def test_the_cpu_engine_equals_plain_pytorch(architecture):
+    network = trained(architecture)
+    plain, engine = TorchEngine(Pipeline(network)), make_engine(network, "cpu", num_threads=2)
+    for count in (1, 2, 5):
+        patches = hand_patches(count, seed=count)
+        expected = plain.run(patches)
+        answer = engine.run(patches)
+        assert answer.shape == (count, 21, 3)
+        assert answer.dtype == np.float32
+        assert np.abs(expected).max() > 0.05
+        assert np.abs(answer - expected).max() * MM_PER_UNIT <= 0.05
+
+
+@pytest.mark.parametrize("refiner", ["std_ref", "or_ref"])
+@pytest.mark.parametrize("architecture", ["deep_prior", "hand_dense"])
+def test_the_cpu_engine_refines_as_plain_pytorch_does(architecture, refiner):
+    network, second = trained(architecture), trained_refiner(refiner)
+    engine = make_engine(network, "cpu", num_threads=1, refiner=second)
+    for count in (1, 3):
+        patches = hand_patches(count, seed=count)
+        with torch.inference_mode():
+            first = network(torch.from_numpy(patches))
+            expected = second(torch.from_numpy(patches), first).numpy()
+        assert np.abs(expected - first.numpy()).max() > 0.02
+        assert np.abs(engine.run(patches) - expected).max() * MM_PER_UNIT <= 0.05
+
+
+def test_hands_do_not_influence_each_other():
+    engine = make_engine(trained("deep_prior"), "cpu", refiner=trained_refiner("or_ref"))
+    patches = hand_patches(4)
+    alone = np.concatenate([engine.run(patches[i:i + 1]) for i in range(4)])
+    np.testing.assert_allclose(engine.run(patches), alone, atol=1e-5)
+
+
+def test_everything_the_network_says_comes_through():
+    network = trained("hand_dense")
+    patches = hand_patches(2)
+    answer = make_engine(network, "cpu").run_full(patches)
+    expected = network.forward_full(torch.from_numpy(patches))
+    assert set(answer) == {"joints", "confidence", "hand", "side", "size"}
+    for name, array in answer.items():
+        assert array.shape == tuple(expected[name].shape)
+        np.testing.assert_allclose(array, expected[name], atol=1e-3)
+    assert set(make_engine(trained("shallow"), "cpu").run_full(patches)) == {"joints"}
+
+
+def test_views_and_mirrored_patches_are_taken_as_they_are():
+    """The estimator shows a left hand in the mirror: an array with a negative stride."""
+    engine, patches = make_engine(trained("deep_prior"), "cpu"), hand_patches(2)
+    mirrored = patches[..., ::-1]
+    np.testing.assert_array_equal(engine.run(mirrored), engine.run(mirrored.copy()))
+    plain = TorchEngine(Pipeline(trained("deep_prior")))
+    np.testing.assert_array_equal(plain.run(mirrored), plain.run(mirrored.copy()))
+
+
+def test_an_answer_is_kept_when_the_next_image_comes():
+    engine = make_engine(trained("deep_prior"), "cpu")
+    first = engine.run(hand_patches(1, seed=1))
+    copy = first.copy()
+    engine.run(hand_patches(1, seed=2))
+    np.testing.assert_array_equal(first, copy)
+
+
+def test_the_network_given_stays_as_it_is():
+    network = build("deep_prior")
+    make_engine(network, "cpu")
+    assert network.training
+    assert all(p.requires_grad for p in network.parameters())
+
+
+@pytest.mark.parametrize("patches", [
+    np.zeros((1, 128, 128), np.float32), np.zeros((1, 1, 64, 64), np.float32), np.zeros((1, 1, 128, 128))])
+def test_other_patches_are_refused(patches):
+    with pytest.raises(InputError, match="patches must be"):
+        make_engine(trained("shallow"), "cpu").run(patches)
+
+
+def test_the_choice_is_logged_with_its_reason(caplog):
+    network = build("shallow")
+    with caplog.at_level(logging.INFO, "hand_pose_ros.runtime"):
+        engine = make_engine(network, num_threads=1)
+    assert engine.name in caplog.text
+    assert "no GPU was found; 1 threads" in caplog.text or "a GPU was found" in caplog.text
+
+
+def test_a_device_that_is_not_there_is_named():
+    network = build("shallow")
+    with pytest.raises(HandPoseError, match="device 'quantum' cannot be used here"):
+        make_engine(network, "quantum")
+    with pytest.raises(HandPoseError, match="num_threads is 0"):
+        make_engine(network, "cpu", num_threads=0)
+    if not torch.cuda.is_available():
+        with pytest.raises(HandPoseError, match="finds no GPU"):
+            make_engine(network, "cuda")
+
+
+@pytest.mark.parametrize(("cores", "threads"), [(1, 1), (2, 2), (4, 3), (8, 4), (64, 4)])
+def test_threads_leave_room_for_the_rest(cores, threads, monkeypatch):
+    monkeypatch.setattr("os.sched_getaffinity", lambda pid: set(range(cores)), raising=False)
+    assert default_threads() == threads
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU")
+@pytest.mark.parametrize("refiner", [None, "or_ref"])
+@pytest.mark.parametrize("architecture", ARCHITECTURES)
+def test_the_gpu_engine_equals_plain_pytorch(architecture, refiner):
+    network = trained(architecture)
+    second = trained_refiner(refiner) if refiner else None
+    engine = make_engine(network, "cuda", refiner=second)
+    plain = TorchEngine(Pipeline(network, second))
+    for count in (1, 3, 2, 9):  # graphs of 1, 4, 2 and 16
+        patches = hand_patches(count, seed=count)
+        assert np.abs(engine.run(patches) - plain.run(patches)).max() * MM_PER_UNIT <= 0.5

@@ -163,7 +163,7 @@ class EstimatorNode(LifecycleNode):
 
     def _subscribe(self, message_type: type, topic: str, callback: Callable[..., None]) -> Subscription:
         def incompatible(event: QoSRequestedIncompatibleQoSInfo) -> None:
-            self._complain(topics.explain_incompatible(self, topic, event.last_policy_kind.name.lower()))
+            self._complain(topics.explain_incompatible(self, topic, qos.policy_name(event.last_policy_kind)))
 
         return self.create_subscription(
             message_type, topic, callback, qos.sensor(), qos_overriding_options=qos.overriding_options(),
@@ -197,7 +197,7 @@ class EstimatorNode(LifecycleNode):
         return SetParametersResult(successful=True)
 
     def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        if self._state != 'active':
+        if self._state not in ('active', 'disabled'):
             response.message = f'the node is {self._state}: activate it first'
             return response
         if request.data and self._worker is None:

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-from rclpy.qos import QoSDurabilityPolicy, QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
+from rclpy.qos import (
+    QoSDurabilityPolicy,
+    QoSHistoryPolicy,
+    QoSProfile,
+    QoSReliabilityPolicy,
+    qos_policy_name_from_kind,
+)
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 RESULTS = QoSProfile(history=QoSHistoryPolicy.KEEP_LAST, depth=10, reliability=QoSReliabilityPolicy.RELIABLE)
@@ -23,3 +29,8 @@ def sensor() -> QoSProfile:
 def overriding_options() -> QoSOverridingOptions:
     """Let the user override history, depth and reliability by `qos_overrides.<topic>.subscription.*` parameters."""
     return QoSOverridingOptions.with_default_policies()
+
+
+def policy_name(kind: int) -> str:
+    """The policy that an event is about, as parameters spell it, e.g. `reliability`."""
+    return str(qos_policy_name_from_kind(kind)).lower()

@@ -203,7 +203,13 @@ def round_cone(start: Tensor, end: Tensor, start_radius: Tensor, end_radius: Ten
 
 
 def box(center: Tensor, axes: Tensor, half: Tensor, view: View) -> Tensor:
-    """Nearness (B, H, W) of a box; `center` (B, 3), `axes` (B, 3, 3) with the axes as columns, `half` sizes (B, 3), m."""
+    """Nearness (B, H, W) of a box.
+
+    Args:
+        center: (B, 3) in metres.
+        axes: (B, 3, 3), its columns the directions of the edges.
+        half: (B, 3) half lengths of the edges, in metres.
+    """
     x, y = view.rays
     enter, leave = None, None
     for axis, h in zip(axes.unbind(2), half.unbind(1), strict=True):

@@ -13,16 +13,17 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from hand_pose_ros.skeleton import HAND21
 from hand_pose_ros.synthetic import renderer
 from hand_pose_ros.synthetic.renderer import View, dot
 from hand_pose_ros.synthetic.rng import Random
 from hand_pose_ros.synthetic.sensors import sensor_table
 
-VIEWS = {'frontal': 0.38, 'egocentric': 0.17, 'overhead': 0.13, 'side': 0.12, 'any': 0.20}
+VIEWS = {'frontal': 0.44, 'egocentric': 0.16, 'overhead': 0.12, 'side': 0.12, 'any': 0.16}
 """Shares of the ways in which a camera looks at a hand."""
 
 # For each of VIEWS: where the fingers point, where the palm faces, and the spread about it in radians (out of the image
-# plane, within it). Frontal: held up to a camera opposite; egocentric: seen from above one's own head; overhead: on a table.
+# plane, within it). Frontal: held up to a camera opposite; egocentric: from one's own head; overhead: over a table.
 _BASES = torch.tensor([[[0, -1, 0], [0, 0, -1]], [[0, -0.6, 0.8], [0, 0.8, 0.6]], [[0, -1, 0], [0, 0, 1]],
                        [[0, -1, 0], [1, 0, 0]], [[0, -1, 0], [0, 0, -1]]], dtype=torch.float32)
 _SCATTER = torch.tensor([[0.45, 0.7], [0.5, 0.7], [0.4, 3.0], [0.5, 1.0], [3.0, 3.0]])
@@ -61,6 +62,15 @@ class Solid:
 
 
 @dataclass
+class Others:
+    """Second hands: their skin (K, V, 3), the samples (K,) they are in, and which of them are left hands (K,)."""
+
+    vertices: Tensor
+    samples: Tensor
+    left: Tensor
+
+
+@dataclass
 class Scene:
     """A batch of scenes, in metres and in the optical frame.
 
@@ -68,7 +78,7 @@ class Scene:
         vertices, joints: (B, V, 3) and (B, 21, 3) of the right hand.
         present: (B,) bool, whether there is a hand at all.
         soft: things with folds and relief (bodies, walls); hard: objects.
-        other, other_of, other_is_left: (K, V, 3) second hands, the samples (K,) that have them, and which side they are.
+        others: second hands.
     """
 
     vertices: Tensor
@@ -76,16 +86,16 @@ class Scene:
     present: Tensor
     soft: list[Solid] = field(default_factory=list)
     hard: list[Solid] = field(default_factory=list)
-    other: Tensor | None = None
-    other_of: Tensor | None = None
-    other_is_left: Tensor | None = None
+    others: Others | None = None
 
 
-def _normalize(vector: Tensor) -> Tensor:
+def normalize(vector: Tensor) -> Tensor:
+    """Vectors (..., 3) of length 1."""
     return vector / dot(vector, vector).sqrt()[..., None]
 
 
-def _cross(a: Tensor, b: Tensor) -> Tensor:
+def cross(a: Tensor, b: Tensor) -> Tensor:
+    """Vector product over the last axis."""
     return torch.stack([a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1], a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2],
                         a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]], -1)
 
@@ -104,7 +114,7 @@ def random_rotation(rng: Random) -> Tensor:
                         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1).reshape(-1, 3, 3)
 
 
-def _spin(vectors: Tensor, axis: int, angle: Tensor) -> Tensor:
+def spin_about(vectors: Tensor, axis: int, angle: Tensor) -> Tensor:
     """Turn vectors (B, N, 3) by `angle` (B,) about a coordinate axis."""
     cos, sin = torch.cos(angle)[:, None], torch.sin(angle)[:, None]
     a, b = (axis + 1) % 3, (axis + 2) % 3
@@ -115,25 +125,33 @@ def _spin(vectors: Tensor, axis: int, angle: Tensor) -> Tensor:
     return torch.stack(out, -1)
 
 
-def sample_views(rng: Random) -> tuple[Tensor, Tensor]:
+def spin(vectors: Tensor, angles: Tensor) -> Tensor:
+    """Turn vectors (B, N, 3) by three `angles` (B, 3) about the axes, first x."""
+    for axis in range(3):
+        vectors = spin_about(vectors, axis, angles[:, axis])
+    return vectors
+
+
+def sample_views(rng: Random, only: str | None = None) -> tuple[Tensor, Tensor]:
     """Rotations (B, 3, 3) from the hand frame to the optical frame, and which of VIEWS (B,) each belongs to."""
-    kind = rng.choice(torch.tensor(list(VIEWS.values()), device=rng.device))
+    weights = [share if only in (None, name) else 0.0 for name, share in VIEWS.items()]
+    kind = rng.choice(torch.tensor(weights, device=rng.device))
     base = _BASES.to(rng.device)[kind]
     spread, roll = _SCATTER.to(rng.device)[kind].unbind(1)
     turned = rng.uniform() < _TURNED.to(rng.device)[kind]
     palm = torch.where(turned[:, None], -base[:, 1], base[:, 1])
     directions = torch.stack([base[:, 0], palm], 1)
-    directions = _spin(directions, 1, rng.normal() * spread)
-    directions = _spin(directions, 0, rng.normal() * spread * 0.8)
-    directions = _spin(directions, 2, rng.normal() * roll)
+    directions = spin_about(directions, 1, rng.normal() * spread)
+    directions = spin_about(directions, 0, rng.normal() * spread * 0.8)
+    directions = spin_about(directions, 2, rng.normal() * roll)
     fingers, palm = directions.unbind(1)
-    structured = torch.stack([_cross(fingers, palm), fingers, palm], 2)
+    structured = torch.stack([cross(fingers, palm), fingers, palm], 2)
     rotation = torch.where((kind == list(VIEWS).index('any'))[:, None, None], random_rotation(rng), structured)
     return rotation, kind
 
 
 def sample_positions(rng: Random, sensor: Tensor) -> Tensor:
-    """(B, 3) where hands are: at the distances of the sensor, mostly near the middle of its image, some near its border."""
+    """(B, 3) where hands are: at the sensor's distances, mostly well inside its image, some across its border."""
     table = lambda name: sensor_table(name, sensor.device)[sensor]  # noqa: E731
     near, far = table('hand_distance').unbind(1)
     z = near + (far - near) * rng.uniform()
@@ -158,145 +176,6 @@ def keep_arm_off_camera(rotation: Tensor, position: Tensor) -> Tensor:
     return torch.where((elbow_z < _ARM_NEAR)[:, None, None], flipped, rotation)
 
 
-class Furnisher:
-    """Adds things to a scene, each from random streams of its own."""
-
-    def __init__(self, rng: Random, scene: Scene, view: Tensor, elbow: Tensor) -> None:
-        self.rng, self.scene, self.view, self.elbow = rng, scene, view, elbow
-        self.center = scene.joints.mean(1)
-        self.far = scene.joints[..., 2].amax(1) + 0.012
-        self._stream = 0
-
-    def _draws(self) -> Random:
-        self._stream += 1
-        return self.rng.fork(self._stream)
-
-    def _chance(self, rng: Random, shares: dict[str, float]) -> Tensor:
-        """(K,) samples chosen with a probability for each of VIEWS."""
-        table = torch.tensor([shares.get(name, shares['any']) for name in VIEWS], device=rng.device)
-        return (rng.uniform() < table[self.view]).nonzero()[:, 0]
-
-    @staticmethod
-    def _ellipsoid(to: list[Solid], samples: Tensor, center: Tensor, axes: Tensor, radii: Tensor) -> None:
-        center, axes, radii = center[samples], axes[samples], radii[samples]
-        to.append(Solid(renderer.ellipsoid, samples, (center, axes, radii), center, radii.amax(1)))
-
-    @staticmethod
-    def _box(to: list[Solid], samples: Tensor, center: Tensor, axes: Tensor, half: Tensor) -> None:
-        center, axes, half = center[samples], axes[samples], half[samples]
-        to.append(Solid(renderer.box, samples, (center, axes, half), center, dot(half, half).sqrt()))
-
-    @staticmethod
-    def _cone(to: list[Solid], samples: Tensor, start: Tensor, end: Tensor, radius: Tensor, end_radius: Tensor) -> None:
-        start, end, radius, end_radius = start[samples], end[samples], radius[samples], end_radius[samples]
-        along = end - start
-        to.append(Solid(renderer.round_cone, samples, (start, end, radius, end_radius), (start + end) / 2,
-                        dot(along, along).sqrt() / 2 + torch.maximum(radius, end_radius)))
-
-    def surface(self) -> None:
-        """A table under the hand or a wall behind it: a plane that arm and hand touch or stay clear of."""
-        rng = self._draws()
-        samples = self._chance(rng, {'overhead': 0.8, 'egocentric': 0.65, 'any': 0.45})
-        down = torch.tensor([0.0, 0.75, 0.66], device=rng.device)
-        away = torch.tensor([0.0, 0.0, 1.0], device=rng.device)
-        table = self.view == list(VIEWS).index('egocentric')
-        normal = _normalize(torch.where(table[:, None], down, away) + rng.normal(3, std=0.22))
-        normal = torch.where(normal[:, 2:] < 0.2, away, normal)
-        touch = dot(normal[:, None], self.scene.vertices).amax(1)
-        gap = torch.where(rng.chance(0.25), 0.0, -torch.log(1 - rng.uniform()) * 0.25)
-        self.scene.soft.append(Solid(renderer.plane, samples, (normal[samples], (touch + gap)[samples])))
-
-    def body(self) -> None:
-        """Torso, head and upper arm of the person whose hand it is, behind the hand."""
-        rng = self._draws()
-        samples = self._chance(rng, {'overhead': 0.1, 'egocentric': 0.05, 'any': 0.6})
-        size = rng.uniform(3, low=0.85, high=1.15)
-        torso = size * torch.tensor([0.20, 0.31, 0.12], device=rng.device)
-        gap = rng.uniform(low=0.01, high=0.5)
-        center = torch.stack([self.center[:, 0] + rng.normal(std=0.16), self.center[:, 1] + rng.uniform(low=-0.1, high=0.45),
-                              self.far + gap + torso[:, 2]], 1)
-        axes = _spin(torch.eye(3, device=rng.device).expand(len(rng), 3, 3), 2, rng.normal(std=0.15))
-        self._ellipsoid(self.scene.soft, samples, center, axes, torso)
-        head = size * torch.tensor([0.078, 0.118, 0.098], device=rng.device)
-        nod = rng.normal(3, std=0.03)
-        above = torch.stack([nod[:, 0], -torso[:, 1] - 0.09 + nod[:, 1], nod[:, 2]], 1)
-        self._ellipsoid(self.scene.soft, samples, center + above, axes, head)
-        shoulder = center + torch.stack([torso[:, 0] * torch.where(rng.chance(0.5), 0.95, -0.95), -0.75 * torso[:, 1],
-                                         torch.zeros_like(gap)], 1)
-        thick = 0.042 * size[:, 0]
-        self._cone(self.scene.soft, samples, self.elbow, shoulder, thick, thick * 1.35)
-
-    def sleeve(self) -> None:
-        """A sleeve from somewhere along the forearm to the elbow, loose or tight."""
-        rng = self._draws()
-        samples = self._chance(rng, {'any': 0.35})
-        wrist = self.scene.joints[:, 0]
-        cuff = wrist + (self.elbow - wrist) * rng.uniform(1, low=0.12, high=0.8)
-        width = rng.uniform(low=0.034, high=0.052)
-        self._cone(self.scene.soft, samples, cuff, self.elbow, width, width * rng.uniform(low=1.0, high=1.4))
-
-    def held(self) -> None:
-        """A ball, a bar or a flat box in the hand."""
-        rng = self._draws()
-        chosen, what = rng.chance(0.14), rng.uniform()
-        joints = self.scene.joints
-        across, along = _normalize(joints[:, 5] - joints[:, 17]), _normalize(joints[:, 9] - joints[:, 0])
-        palmar = _normalize(_cross(across, along))
-        radius = rng.uniform(low=0.010, high=0.038)
-        palm = joints[:, (0, 5, 9, 13, 17)].mean(1) + palmar * (0.012 + radius[:, None])
-        center = palm + 0.5 * (joints[:, (4, 8, 12, 16)].mean(1) - palm)
-        axis = _normalize(across + rng.normal(3, std=0.25))
-        reach = axis * rng.uniform(1, low=0.04, high=0.13)
-        self._ellipsoid(self.scene.hard, (chosen & (what < 0.35)).nonzero()[:, 0], center,
-                  random_rotation(rng), radius[:, None] * rng.uniform(3, low=0.8, high=1.3))
-        self._cone(self.scene.hard, (chosen & (what >= 0.35) & (what < 0.75)).nonzero()[:, 0],
-                  center - reach, center + reach, radius * 0.7, radius * 0.7)
-        frame = torch.stack([across, along, palmar], 2)
-        half = rng.uniform(3, low=0.7, high=1.3) * torch.tensor([0.036, 0.07, 0.007], device=rng.device)
-        self._box(self.scene.hard, (chosen & (what >= 0.75)).nonzero()[:, 0], center, frame, half)
-
-    def clutter(self) -> None:
-        """Things behind, beside and before the hand."""
-        for chance, before in ((0.25, False), (0.25, False), (0.07, True)):
-            rng = self._draws()
-            chosen, what = rng.chance(chance), rng.uniform()
-            size = rng.uniform(3, low=0.012, high=0.05) if before else rng.uniform(3, low=0.03, high=0.2)
-            aside = rng.normal(2, std=0.05) if before else rng.normal(2, std=0.2)
-            z = (self.scene.joints[..., 2].amin(1) - 0.02 - size.amax(1) - rng.uniform(high=0.08) if before
-                 else self.far + size.amax(1) + rng.uniform(high=0.4))
-            center = torch.stack([self.center[:, 0] + aside[:, 0], self.center[:, 1] + aside[:, 1], z], 1)
-            axes = random_rotation(rng)
-            chosen = chosen & (center[:, 2] - size.amax(1) > 0.1)
-            self._ellipsoid(self.scene.hard, (chosen & (what < 0.3)).nonzero()[:, 0], center, axes, size)
-            self._box(self.scene.hard, (chosen & (what >= 0.3) & (what < 0.65)).nonzero()[:, 0], center, axes, size)
-            end = axes[..., 0] * (0.3 if before else 0.5)
-            end = torch.stack([end[:, 0], end[:, 1], end[:, 2].abs() * 0.5], 1)
-            thin = size[:, 1] * (0.5 if before else 0.4)
-            self._cone(self.scene.hard, (chosen & (what >= 0.65)).nonzero()[:, 0], center, center + end,
-                      thin, thin * 1.2)
-
-    def no_hand(self) -> None:
-        """Where there is no hand: an elbow, a forearm's stump, a head or an object in its place."""
-        rng = self._draws()
-        absent, what = ~self.scene.present, rng.uniform()
-        axes = random_rotation(rng)
-        reach = axes[..., 0] * rng.uniform(1, low=0.06, high=0.22)
-        thick = rng.uniform(low=0.02, high=0.055)
-        self._cone(self.scene.soft, (absent & (what < 0.45)).nonzero()[:, 0], self.center - reach,
-                  self.center + reach, thick, thick * rng.uniform(low=0.9, high=1.4))
-        self._ellipsoid(self.scene.soft, (absent & (what >= 0.45) & (what < 0.75)).nonzero()[:, 0], self.center,
-                  axes, rng.uniform(3, low=0.06, high=0.13))
-        self._box(self.scene.hard, (absent & (what >= 0.75) & (what < 0.9)).nonzero()[:, 0], self.center, axes,
-                  rng.uniform(3, low=0.02, high=0.12))
-
-
-def furnish(rng: Random, scene: Scene, view: Tensor, elbow: Tensor) -> None:
-    """Fill scenes with what else there is; `view` (B,) as of `sample_views`, `elbow` (B, 3) in metres."""
-    furnisher = Furnisher(rng, scene, view, elbow)
-    for add in (furnisher.surface, furnisher.body, furnisher.sleeve, furnisher.held, furnisher.clutter, furnisher.no_hand):
-        add()
-
-
 def draw_solids(scene: Scene, view: View, back: Tensor | None = None, relief: Tensor | None = None) -> Tensor:
     """Nearness (B, H, W) of everything but hands.
 
@@ -317,20 +196,34 @@ def draw_solids(scene: Scene, view: View, back: Tensor | None = None, relief: Te
     return image
 
 
-def draw_hands(scene: Scene, faces: Tensor, view: View) -> tuple[Tensor, Tensor | None]:
-    """Nearness of the hands (B, H, W) and of the second hands (K, H, W)."""
+def draw_hands(scene: Scene, faces: Tensor, view: View) -> tuple[Tensor, Tensor]:
+    """Nearness (B, H, W) of the hands, and of the second hands."""
     hands = torch.zeros(len(scene.present), view.height, view.width, device=scene.joints.device)
     there = scene.present.nonzero()[:, 0]
-    if len(there):
-        hands[there] = renderer.rasterise(scene.vertices[there], faces, view[there])
-    if scene.other is None or scene.other_of is None or scene.other_is_left is None:
-        return hands, None
-    others = torch.zeros(len(scene.other_of), view.height, view.width, device=hands.device)
-    for side, winding in ((scene.other_is_left, faces.flip(1)), (~scene.other_is_left, faces)):
-        members = side.nonzero()[:, 0]
-        if len(members):
-            others[members] = renderer.rasterise(scene.other[members], winding, view[scene.other_of[members]])
+    hands[there] = renderer.rasterise(scene.vertices[there], faces, view[there])
+    others = torch.zeros_like(hands)
+    if scene.others is not None:
+        for of_side, winding in ((scene.others.left, faces.flip(1)), (~scene.others.left, faces)):
+            members = of_side.nonzero()[:, 0]
+            samples = scene.others.samples[members]
+            others[samples] = renderer.rasterise(scene.others.vertices[members], winding, view[samples])
     return hands, others
+
+
+def draw_sticks(scene: Scene, elbow: Tensor | None, view: View) -> Tensor:
+    """Nearness (B, H, W) of hands made of sticks: what remains of a hand without its surface."""
+    image = torch.zeros(len(scene.present), view.height, view.width, device=scene.joints.device)
+    there = scene.present.nonzero()[:, 0]
+    joints, view = scene.joints[there], view[there]
+    shown = image[there]
+    for parent, child in HAND21.bones:
+        radius = torch.full((len(there),), 0.012 if parent == 0 else 0.008, device=image.device)
+        shown = torch.maximum(shown, renderer.round_cone(joints[:, parent], joints[:, child], radius, radius, view))
+    if elbow is not None:
+        radius = torch.full((len(there),), 0.025, device=image.device)
+        shown = torch.maximum(shown, renderer.round_cone(joints[:, 0], elbow[there], radius, radius * 1.5, view))
+    image[there] = shown
+    return image
 
 
 def splat(points: Tensor, view: View) -> Tensor:

@@ -1,26 +1,20 @@
-"""Depth sensors: what they are, and what they do to a perfect depth image.
+"""Depth sensors by name: their cameras, ranges and noise, and the chain of effects of each family.
 
-Each effect is one small function `(nearness, shot) -> nearness` over 1/z in 1/m (0 = no reading), so that it can be
-shown alone; a family of sensors is a tuple of effects in the order in which light and electronics apply them.
-Triangulating sensors measure disparity, focal length x baseline / z, which is nearness up to a factor.
-
-Sources: Handa et al., "A benchmark for RGB-D visual odometry, 3D reconstruction and SLAM" (ICL-NUIM, 2014), for the
-structured-light chain (jitter, matching window, quantised disparity); Nguyen et al. 2012 and Khoshelham and Elberink 2012
-for the noise of the first Kinect; Fankhauser et al. 2015 for the second; Sarbolandi et al. 2015 for flying pixels and
-multipath of time-of-flight cameras against structured light; Keselman et al. 2017 for RealSense stereo.
+The effects are in `hand_pose_ros.synthetic.effects`, with their sources.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from hand_pose_ros.geometry import Intrinsics
+from hand_pose_ros.synthetic import effects
+from hand_pose_ros.synthetic.effects import Shot
 from hand_pose_ros.synthetic.rng import Random
 
 
@@ -60,7 +54,8 @@ SENSORS = (
     Sensor('kinect2', 'time_of_flight', Intrinsics(364.5, 364.5, 256, 208, 512, 424), (0.6, 1.2), 0.5, 4.5, noise=1.0),
     Sensor('azure', 'time_of_flight', Intrinsics(504.0, 504.0, 320, 332, 640, 576), (0.3, 1.1), 0.25, 4.0, noise=0.8),
     Sensor('pmd', 'time_of_flight', Intrinsics(210.6, 210.6, 112, 86, 224, 172), (0.25, 0.8), 0.1, 4.0, noise=1.6),
-    Sensor('senz3d', 'time_of_flight', Intrinsics(241.4, 241.4, 160, 120, 320, 240), (0.22, 0.65), 0.15, 1.5, noise=1.5),
+    Sensor('senz3d', 'time_of_flight', Intrinsics(241.4, 241.4, 160, 120, 320, 240), (0.22, 0.65), 0.15, 1.5,
+           noise=1.5),
     Sensor('d435', 'active_stereo', Intrinsics(383.0, 383.0, 320, 240, 640, 480), (0.3, 0.9), 0.2, 6.0,
            noise=0.08, baseline=0.050, step=1 / 32, smoothing=0.5),
     Sensor('d415', 'active_stereo', Intrinsics(606.0, 606.0, 320, 240, 640, 480), (0.4, 1.1), 0.3, 6.0,
@@ -88,221 +83,15 @@ def sensor_table(field: str, device: torch.device) -> Tensor:
                         dtype=torch.float32, device=device)
 
 
-_TILE = 512
-_KINDS = {'white': 0.0, 'smooth': 2.0, 'blobs': 6.0}  # standard deviation of the smoothing, px
-
-
-@cache
-def _noise(kind: str, height: int, width: int, device: torch.device) -> Tensor:
-    """All (height, width) cuts, as a view (_TILE, _TILE, height, width), of a plane tiled with normal noise of unit variance."""
-    tile = Random(torch.tensor([list(_KINDS).index(kind)])).normal(_TILE, _TILE)[0]
-    frequency = torch.fft.fftfreq(_TILE)
-    squared = frequency[:, None] ** 2 + frequency[None] ** 2
-    tile = torch.fft.ifft2(torch.fft.fft2(tile) * torch.exp(-2 * (torch.pi * _KINDS[kind]) ** 2 * squared)).real
-    times = (height + _TILE - 1) // _TILE + 1, (width + _TILE - 1) // _TILE + 1
-    plane = (tile / tile.std()).repeat(*times)[:_TILE + height - 1, :_TILE + width - 1].to(device)
-    return plane.unfold(0, height, 1).unfold(1, width, 1)
-
-
-@dataclass(frozen=True)
-class Shot:
-    """What the noise of one batch of images depends on.
-
-    Attributes:
-        sensor: (B,) index in SENSORS.
-        focal: (B,) focal length in pixels of the images at hand.
-        scale: (B,) its ratio to the sensor's own: below 1 where a window was thinned out.
-        severity: (B,) factor on everything random: no two units, rooms and skins are alike.
-        mirrored: (B,) bool, whether the image is to be mirrored afterwards, so that the projector is on the other side.
-    """
-
-    rng: Random
-    sensor: Tensor
-    focal: Tensor
-    scale: Tensor
-    severity: Tensor
-    mirrored: Tensor
-    height: int
-    width: int
-
-    def of_sensor(self, field: str) -> Tensor:
-        """(B, 1, 1)"""
-        return sensor_table(field, self.sensor.device)[self.sensor][:, None, None]
-
-    @cached_property
-    def disparity_per_nearness(self) -> Tensor:
-        """(B, 1, 1) focal length x baseline of the sensor itself, px m."""
-        return self.of_sensor('fx') * self.of_sensor('baseline')
-
-    def field(self, kind: str) -> Tensor:
-        """(B, H, W) fresh normal noise of unit variance: 'white', 'smooth' (2 px) or 'blobs' (6 px).
-
-        Cut at random from a fixed tile: many times faster than a random number per pixel.
-        """
-        row, column = (self.rng.uniform(2) * _TILE).long().unbind(1)
-        return _noise(kind, self.height, self.width, self.sensor.device)[row, column]
-
-
-def _spread(nearness: Tensor, combine: Callable[[Tensor, Tensor], Tensor] = torch.maximum) -> Tensor:
-    """Maximum (or minimum) over 3x3 pixels."""
-    for axis in (1, 2):
-        length = nearness.shape[axis] - 1
-        head, tail = nearness.narrow(axis, 0, length), nearness.narrow(axis, 1, length)
-        pair = combine(head, tail)
-        nearness = torch.cat([pair.narrow(axis, 0, 1), combine(pair.narrow(axis, 0, length - 1), tail.narrow(axis, 1, length - 1)),
-                              pair.narrow(axis, length - 1, 1)], axis)
-    return nearness
-
-
-def _mean(nearness: Tensor) -> Tensor:
-    """Mean over 3x3 pixels (the image repeated at its border)."""
-    for axis in (1, 2):
-        length = nearness.shape[axis]
-        padded = torch.cat([nearness.narrow(axis, 0, 1), nearness, nearness.narrow(axis, length - 1, 1)], axis)
-        nearness = (padded.narrow(axis, 0, length) + padded.narrow(axis, 1, length) + padded.narrow(axis, 2, length)) * (1 / 3)
-    return nearness
-
-
-def _slope(nearness: Tensor, shot: Shot) -> Tensor:
-    """Squared tangent of the angle of incidence; steps between surfaces do not count (the flatter side of each pixel).
-
-    For a plane, nearness is N . ray, so its gradient in ray slopes is (N_x, N_y) and tan^2 = |gradient|^2 / nearness^2.
-    """
-    total = None
-    for axis in (1, 2):
-        length = nearness.shape[axis] - 1
-        step = (nearness.narrow(axis, 1, length) - nearness.narrow(axis, 0, length)).abs()
-        flat = torch.cat([step.narrow(axis, 0, 1),
-                          torch.minimum(step.narrow(axis, 0, length - 1), step.narrow(axis, 1, length - 1)),
-                          step.narrow(axis, length - 1, 1)], axis)
-        total = flat * flat if total is None else total + flat * flat
-    ratio = shot.focal[:, None, None] / nearness.clamp(min=1e-6)
-    return total * (ratio * ratio)
-
-
-def jitter(nearness: Tensor, shot: Shot) -> Tensor:
-    """Lateral noise: pixels look beside themselves by N(0, 0.5 px) of the sensor, which frays edges (Handa 2014)."""
-    reach = 0.5 * shot.scale[:, None, None] * shot.severity[:, None, None]
-    across = (shot.field('white') * reach).round().long()
-    down = (shot.field('white') * reach).round().long()
-    rows = (torch.arange(shot.height, device=down.device)[:, None] + down).clamp(0, shot.height - 1)
-    columns = (torch.arange(shot.width, device=down.device) + across).clamp(0, shot.width - 1)
-    return nearness.flatten(1).gather(1, (rows * shot.width + columns).flatten(1)).reshape_as(nearness)
-
-
-def shadow(nearness: Tensor, shot: Shot) -> Tensor:
-    """What the projector (or second camera) cannot see has no reading: shadows beside silhouettes on one side.
-
-    A projector at +b sees the pixel u at u - disparity. Along a row that must grow; where it falls back, a nearer
-    surface further right is in the way.
-    """
-    sign = torch.where(shot.mirrored, -1, 1)[:, None, None]
-    facing = torch.where(sign > 0, nearness.flip(2), nearness)  # now the projector is on the left
-    disparity = facing * (shot.focal[:, None, None] * shot.of_sensor('baseline'))
-    seen_at = torch.arange(shot.width, device=nearness.device) + disparity
-    lit = seen_at >= seen_at.cummax(2).values - 1.0
-    return torch.where(torch.where(sign > 0, lit.flip(2), lit), nearness, 0)
-
-
-def matching_window(nearness: Tensor, shot: Shot) -> Tensor:
-    """A window of the pattern that straddles two surfaces matches neither: ragged holes along steps (Handa 2014)."""
-    behind = _spread(nearness) - nearness > 0.03 * nearness
-    before = nearness - _spread(nearness, torch.minimum) > 0.03 * nearness
-    luck = shot.field('smooth') + 0.5 * shot.field('white')
-    bar = shot.severity[:, None, None] * shot.scale[:, None, None]
-    lost = (behind & (luck < 1.2 * bar)) | (before & (luck > 1.9 - 0.9 * bar))
-    return torch.where(lost, 0, nearness)
-
-
-def disparity_noise(nearness: Tensor, shot: Shot) -> Tensor:
-    """Noise of the disparity, smooth since windows overlap, then its quantisation: both grow with z^2 (Khoshelham 2012)."""
-    noise = (0.8 * shot.field('smooth') + 0.6 * shot.field('white')) * (shot.of_sensor('noise') * shot.severity[:, None, None])
-    step = shot.of_sensor('step')
-    disparity = ((nearness * shot.disparity_per_nearness + noise) / step).round() * step
-    return torch.where(nearness > 0, disparity / shot.disparity_per_nearness, 0).clamp(min=0)
-
-
-def grazing_holes(nearness: Tensor, shot: Shot) -> Tensor:
-    """Too little light comes back from grazing surfaces; beyond about 75 degrees most readings fail (Nguyen 2012)."""
-    limit = 4.0 + 1.2 * shot.field('smooth')
-    limit = (limit / shot.severity[:, None, None]).clamp(min=1.5)
-    return torch.where(_slope(nearness, shot) < limit * limit, nearness, 0)
-
-
-def dark_spots(nearness: Tensor, shot: Shot) -> Tensor:
-    """Dark or shiny patches (hair, cloth, rings, wet skin) and single pixels that return nothing."""
-    patchy = 2.3 + 3.0 * shot.rng.uniform(1, 1)
-    speckle = 3.0 + 2.0 * shot.rng.uniform(1, 1)
-    lost = (shot.field('blobs') > patchy) | (shot.field('white') > speckle)
-    return torch.where(lost, 0, nearness)
-
-
-def edge_smear(nearness: Tensor, shot: Shot) -> Tensor:
-    """A pixel gathers light from more than its own square, and the nearer surface sends more: silhouettes grow by about
-    a pixel, and their outermost pixels lie 5-40 mm too deep (measured on recordings of a second Kinect)."""
-    amount = shot.scale[:, None, None] * (0.5 + shot.rng.uniform(1, 1))
-    within = nearness - ((nearness - _mean(nearness)) * (0.06 * amount)).clamp(max=0.015)
-    front = _spread(nearness)
-    ramp = 0.004 + 0.045 * (0.5 + 0.3 * shot.field('white')).clamp(0, 1)
-    grows = (front - nearness > 0.05 * front) & (shot.field('smooth') < 1.6 * amount - 0.9)
-    return torch.where(grows, front / (1 + front * ramp), within)
-
-
-def flying_pixels(nearness: Tensor, shot: Shot) -> Tensor:
-    """At a step of some centimetres a pixel mixes both surfaces: dropped by the driver's filter, or anywhere between.
-
-    (Sarbolandi et al. 2015, section 4.)
-    """
-    front, back = _spread(nearness), _spread(nearness, torch.minimum)
-    behind = front - nearness > 0.06 * front
-    luck = shot.field('white') + shot.field('smooth')
-    kept = 1.2 + 1.2 * shot.rng.uniform(1, 1)  # how sharp the driver's filter is set
-    between = back + (0.5 + 0.35 * shot.field('white')).clamp(0, 1) * (front - back)
-    return torch.where(behind & (luck > -1.3), torch.where(luck > kept, between, 0), nearness)
-
-
-def multipath(nearness: Tensor, shot: Shot) -> Tensor:
-    """Light that bounces inside a hollow (a cupped palm) arrives late: the hollow is seen too deep by millimetres."""
-    size = (shot.height, shot.width)
-    around = functional.avg_pool2d(nearness[:, None], 8, ceil_mode=True)
-    around = functional.interpolate(around, size, mode='bilinear')[:, 0]
-    hollow = (around / nearness.clamp(min=1e-6) - 1).clamp(0, 0.03)
-    gain = 0.4 * shot.severity[:, None, None] * shot.rng.uniform(1, 1)
-    return nearness / (1 + gain * hollow)
-
-
-def tof_noise(nearness: Tensor, shot: Shot) -> Tensor:
-    """Axial noise of the second Kinect (Fankhauser 2015), in mm: 1.5 - 0.5 z + 0.3 z^2 + 0.1 z^1.5 theta^2 / (pi/2 - theta)^2.
-
-    The last factor is tan^2 up to 20 % where it matters.
-    """
-    z = 1 / nearness.clamp(min=0.1)
-    tangent2 = _slope(nearness, shot).clamp(max=40)
-    sigma = 1.5 - 0.5 * z + 0.3 * z * z + 0.1 * z * z.sqrt() * tangent2
-    scatter = sigma * 1e-3 * (shot.of_sensor('noise') * shot.severity[:, None, None])
-    noise = 0.85 * shot.field('white') + 0.5 * shot.field('smooth')
-    return nearness / (1 + nearness * (scatter * noise).clamp(-0.03, 0.03))
-
-
-def fattening(nearness: Tensor, shot: Shot) -> Tensor:
-    """Block matching gives the pixels beside a near surface its disparity: silhouettes bulge by a pixel here and there."""
-    return torch.where(shot.field('smooth') > 0.3 - 0.6 * shot.scale[:, None, None] * shot.severity[:, None, None],
-                       _spread(nearness), nearness)
-
-
-def smoothing(nearness: Tensor, shot: Shot) -> Tensor:
-    """The driver's spatial and temporal filters: a mean within surfaces, none across steps."""
-    front, back = _spread(nearness), _spread(nearness, torch.minimum)
-    inside = front - back < 0.04 * front
-    return nearness + torch.where(inside, (_mean(nearness) - nearness) * shot.of_sensor('smoothing'), 0)
-
-
 FAMILIES: dict[str, tuple[Callable[[Tensor, Shot], Tensor], ...]] = {
-    'structured_light': (shadow, jitter, matching_window, grazing_holes, disparity_noise, smoothing, dark_spots),
-    'time_of_flight': (multipath, edge_smear, tof_noise, flying_pixels, grazing_holes, dark_spots),
-    'active_stereo': (shadow, fattening, jitter, grazing_holes, disparity_noise, smoothing, dark_spots),
+    'structured_light': (effects.shadow, effects.jitter, effects.matching_window, effects.grazing_holes,
+                         effects.disparity_noise, effects.smoothing, effects.dark_spots),
+    'time_of_flight': (effects.multipath, effects.edge_smear, effects.tof_noise, effects.flying_pixels,
+                       effects.grazing_holes, effects.dark_spots),
+    'active_stereo': (effects.shadow, effects.fattening, effects.jitter, effects.grazing_holes,
+                      effects.disparity_noise, effects.smoothing, effects.dark_spots),
 }
-_FAMILY = {family: [i for i, s in enumerate(SENSORS) if s.family == family] for family in FAMILIES}
+"""What happens to the light, in this order."""
 
 
 def sense(nearness: Tensor, seeds: Tensor, sensor: Tensor, focal: Tensor, mirrored: Tensor) -> Tensor:
@@ -312,24 +101,30 @@ def sense(nearness: Tensor, seeds: Tensor, sensor: Tensor, focal: Tensor, mirror
         nearness: (B, H, W), 1/z in 1/m.
         seeds: (B,) of the noise.
         sensor: (B,) indices in SENSORS.
-        focal: (B,) focal length of these images, px.
-        mirrored: (B,) bool, see Shot.
+        focal: (B,) focal length of these images, px; lower than the sensor's where they were thinned out.
+        mirrored: (B,) bool, whether the images are to be mirrored afterwards.
 
     Returns:
         (B, H, W) depth in metres, 0 = no reading.
     """
     depth = torch.zeros_like(nearness)
-    for family, effects in FAMILIES.items():
-        members = torch.isin(sensor, torch.tensor(_FAMILY[family], device=sensor.device)).nonzero()[:, 0]
+    for family, chain in FAMILIES.items():
+        of_family = torch.tensor([s.family == family for s in SENSORS], device=sensor.device)
+        members = of_family[sensor].nonzero()[:, 0]
         if len(members) == 0:
             continue
+
+        def of_sensor(field: str, members: Tensor = members) -> Tensor:
+            return sensor_table(field, sensor.device)[sensor[members]][:, None, None]
+
         rng = Random(seeds[members])
-        shot = Shot(rng, sensor[members], focal[members], focal[members] / sensor_table('fx', sensor.device)[sensor[members]],
-                    0.6 + 0.8 * rng.uniform(), mirrored[members], *nearness.shape[1:])
+        focal_here = focal[members][:, None, None]
+        shot = Shot(rng, focal_here, focal_here / of_sensor('fx'), rng.uniform(1, 1, low=0.6, high=1.4),
+                    mirrored[members][:, None, None], of_sensor('baseline'), of_sensor('noise'), of_sensor('step'),
+                    of_sensor('smoothing'), *nearness.shape[1:])
         image = nearness[members]
-        for effect in effects:
+        for effect in chain:
             image = effect(image, shot)
-        near, far = shot.of_sensor('near'), shot.of_sensor('far')
         z = 1 / image.clamp(min=1e-6)
-        depth[members] = torch.where((z >= near) & (z <= far), z, 0)
+        depth[members] = torch.where((z >= of_sensor('near')) & (z <= of_sensor('far')), z, 0)
     return depth

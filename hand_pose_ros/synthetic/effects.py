@@ -1,0 +1,232 @@
+"""What depth sensors do to a perfect depth image.
+
+Each effect is one small function `(nearness, shot) -> nearness` over 1/z in 1/m (0 = no reading), so that it can be
+shown alone. Triangulating sensors measure disparity, focal length x baseline / z: nearness up to a factor.
+
+Sources: Handa et al. 2014, "A benchmark for RGB-D visual odometry, 3D reconstruction and SLAM" (ICL-NUIM), for the
+structured-light chain (jitter, matching window, quantised disparity); Nguyen et al. 2012 and Khoshelham and Elberink
+2012 for the noise of the first Kinect; Fankhauser et al. 2015 for the second; Sarbolandi et al. 2015 for flying pixels
+and multipath of time-of-flight cameras; Keselman et al. 2017 for RealSense stereo.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from hand_pose_ros.synthetic.rng import Random
+
+_TILE = 512
+_KINDS = {'white': 0.0, 'smooth': 2.0, 'blobs': 6.0}  # standard deviation of the smoothing, px
+
+
+@cache
+def _noise(kind: str, height: int, width: int, device: torch.device) -> Tensor:
+    """A plane tiled with normal noise of unit variance, as a view (_TILE, _TILE, height, width) of all its cuts."""
+    tile = Random(torch.tensor([list(_KINDS).index(kind)])).normal(_TILE, _TILE)[0]
+    frequency = torch.fft.fftfreq(_TILE)
+    squared = frequency[:, None] ** 2 + frequency[None] ** 2
+    tile = torch.fft.ifft2(torch.fft.fft2(tile) * torch.exp(-2 * (torch.pi * _KINDS[kind]) ** 2 * squared)).real
+    times = (height + _TILE - 1) // _TILE + 1, (width + _TILE - 1) // _TILE + 1
+    plane = (tile / tile.std()).repeat(*times)[:_TILE + height - 1, :_TILE + width - 1].to(device)
+    return plane.unfold(0, height, 1).unfold(1, width, 1)
+
+
+@dataclass(frozen=True)
+class Shot:
+    """What the noise of one batch of images depends on; tensors are (B, 1, 1).
+
+    Attributes:
+        focal: focal length in pixels of the images at hand.
+        scale: its ratio to the sensor's own: below 1 where a window was thinned out.
+        severity: factor on everything random: no two units, rooms and skins are alike.
+        mirrored: bool, whether the image is to be mirrored afterwards, so that the projector is on the other side.
+        baseline, noise, step, smoothing: see sensors.Sensor.
+    """
+
+    rng: Random
+    focal: Tensor
+    scale: Tensor
+    severity: Tensor
+    mirrored: Tensor
+    baseline: Tensor
+    noise: Tensor
+    step: Tensor
+    smoothing: Tensor
+    height: int
+    width: int
+
+    @property
+    def disparity_per_nearness(self) -> Tensor:
+        """Focal length x baseline of the sensor itself, px m."""
+        return self.focal / self.scale * self.baseline
+
+    def field(self, kind: str) -> Tensor:
+        """(B, H, W) fresh normal noise of unit variance: 'white', 'smooth' (over 2 px) or 'blobs' (6 px).
+
+        Cut at random from a fixed tile: many times faster than a random number per pixel.
+        """
+        row, column = (self.rng.uniform(2) * _TILE).long().unbind(1)
+        return _noise(kind, self.height, self.width, self.rng.device)[row, column]
+
+
+def _spread(nearness: Tensor, combine: Callable[[Tensor, Tensor], Tensor] = torch.maximum) -> Tensor:
+    """Maximum (or minimum) over 3x3 pixels."""
+    for axis in (1, 2):
+        length = nearness.shape[axis] - 1
+        head, tail = nearness.narrow(axis, 0, length), nearness.narrow(axis, 1, length)
+        pair = combine(head, tail)
+        middle = combine(pair.narrow(axis, 0, length - 1), tail.narrow(axis, 1, length - 1))
+        nearness = torch.cat([pair.narrow(axis, 0, 1), middle, pair.narrow(axis, length - 1, 1)], axis)
+    return nearness
+
+
+def _mean(nearness: Tensor) -> Tensor:
+    """Mean over 3x3 pixels (the image repeated at its border)."""
+    for axis in (1, 2):
+        length = nearness.shape[axis]
+        padded = torch.cat([nearness.narrow(axis, 0, 1), nearness, nearness.narrow(axis, length - 1, 1)], axis)
+        before, here, after = (padded.narrow(axis, start, length) for start in range(3))
+        nearness = (before + here + after) * (1 / 3)
+    return nearness
+
+
+def _slope(nearness: Tensor, shot: Shot) -> Tensor:
+    """Squared tangent of the angle of incidence; steps between surfaces do not count (the flatter side of each pixel).
+
+    For a plane, nearness is N . ray, so its gradient in ray slopes is (N_x, N_y) and tan^2 = |gradient|^2 / nearness^2.
+    """
+    total = torch.zeros_like(nearness)
+    for axis in (1, 2):
+        length = nearness.shape[axis] - 1
+        step = (nearness.narrow(axis, 1, length) - nearness.narrow(axis, 0, length)).abs()
+        flat = torch.cat([step.narrow(axis, 0, 1),
+                          torch.minimum(step.narrow(axis, 0, length - 1), step.narrow(axis, 1, length - 1)),
+                          step.narrow(axis, length - 1, 1)], axis)
+        total = total + flat * flat
+    ratio = shot.focal / nearness.clamp(min=1e-6)
+    return total * (ratio * ratio)
+
+
+def jitter(nearness: Tensor, shot: Shot) -> Tensor:
+    """Lateral noise: pixels look beside themselves by N(0, 0.5 px) of the sensor, which frays edges (Handa 2014)."""
+    reach = 0.5 * shot.scale * shot.severity
+    across = (shot.field('white') * reach).round().long()
+    down = (shot.field('white') * reach).round().long()
+    rows = (torch.arange(shot.height, device=down.device)[:, None] + down).clamp(0, shot.height - 1)
+    columns = (torch.arange(shot.width, device=down.device) + across).clamp(0, shot.width - 1)
+    return nearness.flatten(1).gather(1, (rows * shot.width + columns).flatten(1)).reshape_as(nearness)
+
+
+def shadow(nearness: Tensor, shot: Shot) -> Tensor:
+    """What the projector (or second camera) cannot see has no reading: shadows beside silhouettes on one side.
+
+    A projector at +b sees the pixel u at u - disparity. Along a row that must grow; where it falls back, a nearer
+    surface further right is in the way.
+    """
+    sign = torch.where(shot.mirrored, -1, 1)
+    facing = torch.where(sign > 0, nearness.flip(2), nearness)  # now the projector is on the left
+    disparity = facing * (shot.focal * shot.baseline)
+    seen_at = torch.arange(shot.width, device=nearness.device) + disparity
+    lit = seen_at >= seen_at.cummax(2).values - 1.0
+    return torch.where(torch.where(sign > 0, lit.flip(2), lit), nearness, 0)
+
+
+def matching_window(nearness: Tensor, shot: Shot) -> Tensor:
+    """A window of the pattern that straddles two surfaces matches neither: ragged holes along steps (Handa 2014)."""
+    behind = _spread(nearness) - nearness > 0.03 * nearness
+    before = nearness - _spread(nearness, torch.minimum) > 0.03 * nearness
+    luck = shot.field('smooth') + 0.5 * shot.field('white')
+    bar = shot.severity * shot.scale
+    lost = (behind & (luck < 1.2 * bar)) | (before & (luck > 1.9 - 0.9 * bar))
+    return torch.where(lost, 0, nearness)
+
+
+def disparity_noise(nearness: Tensor, shot: Shot) -> Tensor:
+    """Noise of the disparity, smooth since windows overlap, then its quantum: in depth both grow with z^2.
+
+    (Khoshelham and Elberink 2012.)
+    """
+    noise = (0.8 * shot.field('smooth') + 0.6 * shot.field('white')) * (shot.noise * shot.severity)
+    disparity = ((nearness * shot.disparity_per_nearness + noise) / shot.step).round() * shot.step
+    return torch.where(nearness > 0, disparity / shot.disparity_per_nearness, 0).clamp(min=0)
+
+
+def grazing_holes(nearness: Tensor, shot: Shot) -> Tensor:
+    """Too little light comes back from grazing surfaces; beyond about 75 degrees most readings fail (Nguyen 2012)."""
+    limit = 4.0 + 1.2 * shot.field('smooth')
+    limit = (limit / shot.severity).clamp(min=1.5)
+    return torch.where(_slope(nearness, shot) < limit * limit, nearness, 0)
+
+
+def dark_spots(nearness: Tensor, shot: Shot) -> Tensor:
+    """Dark or shiny patches (hair, cloth, rings, wet skin) and single pixels that return nothing."""
+    patchy = 2.3 + 3.0 * shot.rng.uniform(1, 1)
+    speckle = 3.0 + 2.0 * shot.rng.uniform(1, 1)
+    lost = (shot.field('blobs') > patchy) | (shot.field('white') > speckle)
+    return torch.where(lost, 0, nearness)
+
+
+def edge_smear(nearness: Tensor, shot: Shot) -> Tensor:
+    """A pixel gathers light from more than its own square, and the nearer surface sends more: silhouettes grow by about
+    a pixel, and their outermost pixels lie 5-40 mm too deep (measured on recordings of a second Kinect)."""
+    amount = shot.scale * (0.5 + shot.rng.uniform(1, 1))
+    within = nearness - ((nearness - _mean(nearness)) * (0.06 * amount)).clamp(max=0.015)
+    front = _spread(nearness)
+    ramp = 0.004 + 0.045 * (0.5 + 0.3 * shot.field('white')).clamp(0, 1)
+    grows = (front - nearness > 0.05 * front) & (shot.field('smooth') < 1.6 * amount - 0.9)
+    return torch.where(grows, front / (1 + front * ramp), within)
+
+
+def flying_pixels(nearness: Tensor, shot: Shot) -> Tensor:
+    """At a step of some centimetres a pixel mixes both surfaces: dropped by the driver's filter, or anywhere between.
+
+    (Sarbolandi et al. 2015, section 4.)
+    """
+    front, back = _spread(nearness), _spread(nearness, torch.minimum)
+    behind = front - nearness > 0.06 * front
+    luck = shot.field('white') + shot.field('smooth')
+    kept = 1.2 + 1.2 * shot.rng.uniform(1, 1)  # how sharp the driver's filter is set
+    between = back + (0.5 + 0.35 * shot.field('white')).clamp(0, 1) * (front - back)
+    return torch.where(behind & (luck > -1.3), torch.where(luck > kept, between, 0), nearness)
+
+
+def multipath(nearness: Tensor, shot: Shot) -> Tensor:
+    """Light that bounces inside a hollow (a cupped palm) arrives late: the hollow is seen too deep by millimetres."""
+    size = (shot.height, shot.width)
+    around = functional.avg_pool2d(nearness[:, None], 8, ceil_mode=True)
+    around = functional.interpolate(around, size, mode='bilinear')[:, 0]
+    hollow = (around / nearness.clamp(min=1e-6) - 1).clamp(0, 0.03)
+    gain = 0.4 * shot.severity * shot.rng.uniform(1, 1)
+    return nearness / (1 + gain * hollow)
+
+
+def tof_noise(nearness: Tensor, shot: Shot) -> Tensor:
+    """Axial noise of the second Kinect (Fankhauser 2015).
+
+    In mm, sigma = 1.5 - 0.5 z + 0.3 z^2 + 0.1 z^1.5 theta^2 / (pi/2 - theta)^2; the last fraction is written as tan^2.
+    """
+    z = 1 / nearness.clamp(min=0.1)
+    tangent2 = _slope(nearness, shot).clamp(max=40)
+    sigma = 1.5 - 0.5 * z + 0.3 * z * z + 0.1 * z * z.sqrt() * tangent2
+    scatter = sigma * 1e-3 * (shot.noise * shot.severity)
+    noise = 0.85 * shot.field('white') + 0.5 * shot.field('smooth')
+    return nearness / (1 + nearness * (scatter * noise).clamp(-0.03, 0.03))
+
+
+def fattening(nearness: Tensor, shot: Shot) -> Tensor:
+    """Block matching gives the pixels beside a near surface its disparity: silhouettes bulge here and there."""
+    return torch.where(shot.field('smooth') > 0.3 - 0.6 * shot.scale * shot.severity,
+                       _spread(nearness), nearness)
+
+
+def smoothing(nearness: Tensor, shot: Shot) -> Tensor:
+    """The driver's spatial and temporal filters: a mean within surfaces, none across steps."""
+    front, back = _spread(nearness), _spread(nearness, torch.minimum)
+    inside = front - back < 0.04 * front
+    return nearness + torch.where(inside, (_mean(nearness) - nearness) * shot.smoothing, 0)

@@ -1,0 +1,217 @@
+"""A scene together with the camera that sees it: built from a seed, drawn into any window of the camera's image."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from hand_pose_ros.geometry import PATCH_SIZE
+from hand_pose_ros.synthetic import scenes
+from hand_pose_ros.synthetic.crops import settle
+from hand_pose_ros.synthetic.furniture import furnish
+from hand_pose_ros.synthetic.hand import HandModel
+from hand_pose_ros.synthetic.poses import LIMITS, sample_poses
+from hand_pose_ros.synthetic.renderer import View, depth_of
+from hand_pose_ros.synthetic.rng import Random
+from hand_pose_ros.synthetic.scenes import Scene
+from hand_pose_ros.synthetic.sensors import sensor_table
+from hand_pose_ros.synthetic.shapes import sample_shapes
+
+CUBE_SIDE = 0.30
+"""Of the product's detector, metres."""
+WINDOW = 144
+"""Pixels across the window that is drawn for a patch: the patch and a margin for effects that look sideways."""
+
+_COARSE, _COARSE_SIDE = 64, 0.64  # pixels and metres across the image in which the detector's rule runs
+_NEAREST = 24  # of its pixels (1 cm2 each) make the first guess: something from a finger to a hand
+_NEGATIVES = 0.05  # share of samples without a hand
+_SECOND_HAND = 0.08  # share of samples with another hand nearby
+_SECOND_BLOCK = 8
+
+_SHAPE, _POSE, _VIEW, _CAMERA, _FURNITURE, _SECOND, CROP, _MOTION = range(8)  # streams of random numbers
+
+
+@dataclass(frozen=True)
+class Ingredients:
+    """What makes the hands real; switch one off to learn what it is worth.
+
+    Attributes:
+        surface: skin; without it, sticks and balls.
+        poses: the pose sampler; without it, independent uniform angles.
+        forearm: the arm behind the wrist.
+        scenes: anything but the hand.
+        noise: the sensor; without it, perfect depth.
+        detector: crops centred as the product does; without it, on the true mean of the joints.
+    """
+
+    surface: bool = True
+    poses: bool = True
+    forearm: bool = True
+    scenes: bool = True
+    noise: bool = True
+    detector: bool = True
+
+
+@dataclass
+class Motion:
+    """How hands depart from their sample: one row, or several to move between.
+
+    Attributes:
+        pose: (N, P) radians.
+        turn: (N, 3) radians, about the three axes of the camera.
+        shift: (N, 3) metres; nearer: (N, 1) factor on the position.
+    """
+
+    pose: Tensor
+    turn: Tensor
+    shift: Tensor
+    nearer: Tensor
+
+    @staticmethod
+    def draw(seed: Tensor, number: int) -> Motion:
+        """That many places to go to, for one seed (1,)."""
+        rng = Random(seed).fork(_MOTION)
+        high, low = (rng.uniform(2, number)[0] * 2 ** 24).long()
+        return Motion(sample_poses(Random(high << 24 | low)), rng.normal(number, 3, std=0.25)[0],
+                      rng.normal(number, 3, std=0.025)[0], rng.uniform(number, 1, low=0.9, high=1.1)[0])
+
+    def between(self, key: int, part: float) -> Motion:
+        """`part` of the way from row `key` to the next, starting and ending softly."""
+        ease = (1 - math.cos(math.pi * part)) / 2
+        return Motion(*((t[key:key + 1] + ease * (t[key + 1:key + 2] - t[key:key + 1]))
+                         for t in (self.pose, self.turn, self.shift, self.nearer)))
+
+
+@dataclass
+class Stage:
+    """Scenes with the cameras that see them; all for right hands, to be mirrored where `mirrored`."""
+
+    seeds: Tensor
+    scene: Scene
+    sensor: Tensor
+    mirrored: Tensor
+    position: Tensor
+    elbow: Tensor
+
+    def camera(self, scale: Tensor | float = 1.0) -> tuple[Tensor, ...]:
+        """fx, fy, cx, cy, width and height (B,) of the sensors with `scale` times their pixels."""
+        fx, fy, cx, cy, width, height = (sensor_table(name, self.sensor.device)[self.sensor]
+                                         for name in ('fx', 'fy', 'cx', 'cy', 'width', 'height'))
+        cx = torch.where(self.mirrored, width - 1 - cx, cx)
+        return (fx * scale, fy * scale, (cx + 0.5) * scale - 0.5, (cy + 0.5) * scale - 0.5,
+                (width * scale).round(), (height * scale).round())
+
+    def window(self, center: Tensor, side: Tensor) -> tuple[View, Tensor]:
+        """The pixels of the sensor that the crop can see, and which of them (B, H, W) lie in its image.
+
+        A sensor finer than the patch is thinned out to the patch's grid: nearest-neighbour cropping does that anyway.
+        """
+        fx, fy, cx, cy, *_ = self.camera()
+        scale = (PATCH_SIZE * center[:, 2] / side / torch.maximum(fx, fy)).clamp(max=1)
+        fx, fy, cx, cy, width, height = self.camera(scale)
+        left = (center[:, 0] / center[:, 2] * fx + cx - (WINDOW - 1) / 2).round()
+        top = (center[:, 1] / center[:, 2] * fy + cy - (WINDOW - 1) / 2).round()
+        pixels = torch.arange(WINDOW, device=center.device)
+        columns, rows = pixels + left[:, None], pixels + top[:, None]
+        inside = (((columns >= 0) & (columns < width[:, None]))[:, None, :]
+                  & ((rows >= 0) & (rows < height[:, None]))[:, :, None])
+        return View(fx, fy, cx - left, cy - top, WINDOW, WINDOW), inside
+
+class Stages:
+    """Makes stages; see `SyntheticHands` for the arguments. `sensors`: indices in SENSORS to draw from."""
+
+    def __init__(self, ingredients: Ingredients, sensors: Tensor, device: torch.device) -> None:
+        self.ingredients = ingredients
+        self._sensors = sensors.to(device)
+        self._hand = HandModel().to(device)
+        hand_only = (self._hand.vertex_part[self._hand.faces] != 6).any(1)
+        self._faces = self._hand.faces if self.ingredients.forearm else self._hand.faces[hand_only]
+        self._drawn = self._faces.unique()
+        forearm = (self._hand.vertex_part == 6).nonzero()[:, 0]
+        rest, _ = self._hand(sample_shapes(Random(torch.zeros(1, device=device))), self._hand.rest[None])
+        self._elbow = forearm[rest[0, forearm, 1].argsort()[:8]]
+
+    def build(self, seeds: Tensor, motion: Motion | None = None, around: Scene | None = None) -> Stage:
+        """The scenes of these seeds (B,); with `motion`, hands held up to the camera in rooms made `around` others."""
+        rng = Random(seeds)
+        pose = self._poses(rng.fork(_POSE)) if motion is None else motion.pose
+        vertices, joints = self._hand(sample_shapes(rng.fork(_SHAPE)), pose)
+        rotation, kind = scenes.sample_views(rng.fork(_VIEW), only=None if motion is None else 'frontal')
+        draws = rng.fork(_CAMERA)
+        sensor = self._sensors[draws.choice(torch.ones(len(self._sensors)))]
+        mirrored, present = draws.chance(0.5), ~draws.chance(_NEGATIVES)
+        position = scenes.sample_positions(draws, sensor)
+        if motion is not None:
+            present = torch.ones_like(present)
+            position = position * motion.nearer + motion.shift
+            rotation = scenes.spin(rotation.mT, motion.turn).mT
+        rotation = scenes.keep_arm_off_camera(rotation, position)
+        vertices, joints = scenes.place(vertices, joints, rotation, position)
+        scene = Scene(vertices, joints, present)
+        stage = Stage(seeds, scene, sensor, mirrored, position, vertices[:, self._elbow].mean(1))
+        if self.ingredients.scenes:
+            furnish(rng.fork(_FURNITURE), scene, kind, stage.elbow, around, arm=self.ingredients.forearm)
+            if motion is None:
+                self._second_hands(stage)
+        return stage
+
+    def _poses(self, rng: Random) -> Tensor:
+        if self.ingredients.poses:
+            return sample_poses(rng)
+        low, high = LIMITS.to(rng.device).unbind(1)
+        return low + (high - low) * rng.uniform(len(LIMITS))
+
+    def _second_hands(self, stage: Stage) -> None:
+        chosen = Random(stage.seeds).fork(_SECOND).chance(_SECOND_HAND).nonzero()[:, 0]
+        if len(chosen) == 0:
+            return
+        rng = Random(stage.seeds[chosen]).fork(_SECOND)
+        rng.uniform()  # the one that chose them
+        rotation, _ = scenes.sample_views(rng.fork(0))
+        left = rng.chance(0.7)
+        angle = 2 * math.pi * rng.uniform()
+        away = 0.09 + 0.12 * rng.uniform()
+        offset = torch.stack([away * torch.cos(angle), away * torch.sin(angle), 0.05 * rng.normal()], 1)
+        position = stage.position[chosen] + offset
+        rotation = scenes.keep_arm_off_camera(rotation, position)
+        vertices, joints = [], []
+        for some in chosen.split(_SECOND_BLOCK):  # whole blocks, as in `batch`
+            full = torch.cat([some, some[-1:].expand(_SECOND_BLOCK - len(some))])
+            draws = Random(stage.seeds[full]).fork(_SECOND)
+            v, j = self._hand(sample_shapes(draws.fork(1)), sample_poses(draws.fork(2)))
+            vertices.append(v[:len(some)])
+            joints.append(j[:len(some)])
+        mirror = torch.where(left, -1.0, 1.0)[:, None, None]
+        mirror = torch.cat([mirror, torch.ones_like(mirror), torch.ones_like(mirror)], 2)
+        placed, _ = scenes.place(torch.cat(vertices) * mirror, torch.cat(joints) * mirror, rotation, position)
+        stage.scene.others = scenes.Others(placed, chosen, left)
+
+    def detect(self, stage: Stage) -> Tensor:
+        """Where the product's detector settles, (B, 3) in metres, found in a coarse image around the hand."""
+        x, y, z = stage.position.unbind(1)
+        focal = _COARSE / _COARSE_SIDE * z
+        middle = (_COARSE - 1) / 2
+        view = View(focal, focal, middle - x / z * focal, middle - y / z * focal, _COARSE, _COARSE)
+        scene = stage.scene
+        hand = scenes.splat(scene.vertices[:, self._drawn], view)
+        solids = scenes.draw_solids(scene, view, stage.position[:, 2] + CUBE_SIDE)
+        image = torch.maximum(solids, torch.where(scene.present[:, None, None], hand, 0))
+        if scene.others is not None:
+            samples = scene.others.samples
+            image[samples] = torch.maximum(image[samples], scenes.splat(scene.others.vertices, view[samples]))
+        fx, fy, cx, cy, width, height = (t[:, None, None] for t in stage.camera())
+        column, row = view.rays[0] * fx + cx, view.rays[1] * fy + cy
+        seen = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        return settle(depth_of(torch.where(seen, image, 0)), view, CUBE_SIDE, _NEAREST, otherwise=stage.position)
+
+    def draw(self, stage: Stage, view: View, back: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Nearness of everything, and of the hand alone."""
+        relief = scenes.smooth_relief(Random(stage.seeds).fork(_FURNITURE).fork(99), view)
+        image = scenes.draw_solids(stage.scene, view, back, relief)
+        own, others = scenes.draw_hands(stage.scene, self._faces, view)
+        if not self.ingredients.surface:
+            own = scenes.draw_sticks(stage.scene, stage.elbow if self.ingredients.forearm else None, view)
+        return torch.maximum(torch.maximum(image, others), own), own

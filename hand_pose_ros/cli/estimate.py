@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from hand_pose_ros.bags import BagWriter, DepthBag
+from hand_pose_ros.bags import DepthBag
+from hand_pose_ros.cli.hand_bag import HandBag
 from hand_pose_ros.depth import read_png
 from hand_pose_ros.drawing import overlay
 from hand_pose_ros.errors import HandPoseError, InputError
@@ -58,6 +59,8 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('--side', default='auto', choices=('auto', 'left', 'right'), help='which hand it is (auto)')
     parser.add_argument('--cube-size', type=float, metavar='M', help='side of the cube around a hand, metres')
     parser.add_argument('--max-hands', type=int, default=1, metavar='N', help='at most N hands per image (1)')
+    parser.add_argument('--min-score', type=float, default=0.3, metavar='S',
+                        help='leave out hands below this score (0.3)')
     parser.add_argument('--out', type=Path, metavar='FILE', help='.npz or .mcap')
     parser.add_argument('--overlay', type=Path, metavar='FOLDER', help='a picture of every image with its joints')
     parser.set_defaults(parser=parser)
@@ -72,15 +75,15 @@ def run(args: argparse.Namespace) -> int:
         from hand_pose_ros.estimator import HandPoseEstimator  # imports torch: not for --help and bad arguments
         options = {} if args.cube_size is None else {'cube_side': args.cube_size}
         estimator = HandPoseEstimator.from_pretrained(
-            args.model, device=args.device, side=args.side, max_hands=args.max_hands, **options)
+            args.model, device=args.device, side=args.side, max_hands=args.max_hands, min_score=args.min_score,
+            **options)
         sinks: list[_Sink] = []
         if args.overlay:
             sinks.append(_Overlays(args.overlay, estimator.skeleton))
         if args.out and args.out.suffix == '.npz':
             sinks.append(_Arrays(args.out, estimator.skeleton))
         elif args.out:
-            writer = stack.enter_context(BagWriter(args.out))
-            sinks.append(_HandBag(writer, estimator.skeleton, estimator.metadata))
+            sinks.append(_Messages(stack.enter_context(HandBag(args.out, estimator.skeleton, estimator.metadata))))
         return estimate(images, count, estimator, sinks)
 
 
@@ -224,39 +227,15 @@ class _Arrays:
         os.replace(part, self._path)
 
 
-class _HandBag:
+class _Messages:
     """An MCAP file with the messages that the node would publish."""
 
-    def __init__(self, writer: BagWriter, skeleton: Skeleton, metadata: dict[str, Any]) -> None:
-        self._writer, self._skeleton, self._metadata = writer, skeleton, metadata
-        self._begun = False
-        try:
-            from hand_pose_ros.ros.markers import HandMarkers
-            self._markers: Any = HandMarkers(skeleton)
-        except HandPoseError:  # no ROS, no markers; the joints need none
-            self._markers = None
+    def __init__(self, bag: HandBag) -> None:
+        self._bag = bag
 
     def add(self, image: DepthInput, depth: NDArray[np.float32], intrinsics: Intrinsics,
             hands: Sequence[HandEstimate]) -> None:
-        if not self._begun:
-            about = self._metadata
-            self._writer.write_skeleton(image.stamp_ns, image.frame_id, self._skeleton,
-                                        str(about.get('name', about['architecture'])), str(about['version']))
-            self._begun = True
-        self._writer.write_hands(image.stamp_ns, image.frame_id, hands, self._skeleton)
-        if self._markers is not None:
-            self._writer.write_serialized('/hand/markers', 'visualization_msgs/msg/MarkerArray',
-                                          self._serialized_markers(image, hands), image.stamp_ns)
+        self._bag.add(image, hands)
 
     def finish(self) -> None:
         pass
-
-    def _serialized_markers(self, image: DepthInput, hands: Sequence[HandEstimate]) -> bytes:
-        from builtin_interfaces.msg import Time
-        from rclpy.serialization import serialize_message
-        from std_msgs.msg import Header
-
-        from hand_pose_ros.ros.conversions import hands_to_msg
-        sec, nanosec = divmod(image.stamp_ns, 1_000_000_000)
-        header = Header(stamp=Time(sec=sec, nanosec=nanosec), frame_id=image.frame_id)
-        return serialize_message(self._markers.update(hands_to_msg(header, hands, self._skeleton), lifetime_s=0.0))

@@ -68,8 +68,8 @@ def add_parser(subparsers: Any) -> None:
     bags.add_argument('--depth-topic', metavar='TOPIC', help='needed if several topics carry depth')
     bags.add_argument('--camera-info-topic', metavar='TOPIC', help='if it is not beside the depth topic')
     bags.add_argument('--depth-scale', type=float, metavar='M', help='metres per unit of 16-bit depth (0.001)')
-    bags.add_argument('--out-bag', metavar='BAG', help='write /hand/joints there, to be played beside the original; '
-                      'with several bags a folder')
+    bags.add_argument('--out-bag', metavar='BAG', help='write /hand/joints and /hand/markers there, to be played '
+                      'beside the original; with several bags a folder')
     bags.add_argument('--via-ros', action='store_true', help='play the bag through the live node at its pace, and '
                       'report the images it dropped and the latency from image to joints')
     bags.add_argument('--jobs', type=int, metavar='N', help='bags at the same time (default: one per core)')
@@ -104,11 +104,13 @@ def _run_text(args: argparse.Namespace) -> int:
 
 
 def _run_bag(args: argparse.Namespace) -> int:
+    from hand_pose_ros.cli.hand_bag import HandBag
     from hand_pose_ros.evaluation.bag_evaluation import evaluate_bag, read_depths
 
     settings = _settings(args)
+    sink = partial(HandBag, args.out_bag) if args.out_bag else None
     result = _evaluate_live(args, settings) if args.via_ros else \
-        evaluate_bag(args.bags[0], settings, progress=_progress('frames'), hands_bag=args.out_bag)
+        evaluate_bag(args.bags[0], settings, _progress('frames'), sink)
     others = [published.load_result(source) for source in args.compare]
     _deliver(args, result, others, lambda rows: read_depths(args.bags[0], rows, settings))
     return int(result.info['damaged'])
@@ -120,11 +122,8 @@ def _evaluate_live(args: argparse.Namespace, settings: Settings) -> Result:
         args.error('--out-bag does not work with --via-ros: record /hand/joints instead')
     from hand_pose_ros.bags import DepthBag
     from hand_pose_ros.evaluation.ground_truth import with_truth
+    from hand_pose_ros.ros.live import play_through_node
     from hand_pose_ros.skeleton import get_skeleton
-    try:
-        from hand_pose_ros.ros.live import play_through_node
-    except ImportError as error:
-        raise HandPoseError(f'--via-ros needs ROS 2, rclpy and the messages of this package ({error})') from error
 
     parameters = {'model': args.model, 'device': args.device, 'side': args.side, 'cube_size': args.cube_size,
                   'min_score': args.min_score, 'depth_scale': args.depth_scale}
@@ -154,13 +153,14 @@ def _evaluate_live(args: argparse.Namespace, settings: Settings) -> Result:
 
 
 def _run_bags(args: argparse.Namespace) -> int:
+    from hand_pose_ros.cli.hand_bag import HandBag
     from hand_pose_ros.evaluation.bag_evaluation import evaluate_bags, read_depths
 
     if args.compare or args.via_ros:
         args.error('--compare and --via-ros work with one bag, not with several')
     settings, names = _settings(args), _names(args.bags)
-    hands_bags = {bag: Path(args.out_bag) / f'{names[bag]}.mcap' for bag in args.bags} if args.out_bag else {}
-    outcomes = evaluate_bags(args.bags, settings, args.jobs, _progress('bags'), hands_bags)
+    sinks = {bag: partial(HandBag, Path(args.out_bag) / f'{names[bag]}.mcap') for bag in args.bags if args.out_bag}
+    outcomes = evaluate_bags(args.bags, settings, args.jobs, _progress('bags'), sinks)
     summaries: dict[str, Any] = {}
     for bag, outcome in outcomes.items():
         print(f'\n{bag}')

@@ -6,26 +6,35 @@ import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hand_pose_ros.bags import BagWriter, DepthBag, Frame
+from hand_pose_ros.bags import DepthBag, Frame
 from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.estimator import HandEstimate, HandPoseEstimator
 from hand_pose_ros.evaluation.ground_truth import with_truth
 from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.geometry import Intrinsics
+from hand_pose_ros.skeleton import Skeleton
 
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 """Passes items on and shows how far it is; the number is how many there will be."""
 
+
+class Sink(Protocol):
+    """Is told the hands of each image."""
+
+    def add(self, image: Frame, hands: Sequence[HandEstimate]) -> None: ...
+
+
+OpenSink = Callable[[Skeleton, Mapping[str, Any]], AbstractContextManager[Sink]]
 STAGES = ('read', 'decode', 'detect', 'crop', 'predict', 'refine', 'uncrop')
 
 
@@ -50,7 +59,7 @@ class Settings:
 
 
 def evaluate_bag(path: str | Path, settings: Settings, progress: Progress | None = None,
-                 hands_bag: str | Path | None = None) -> Result:
+                 open_sink: OpenSink | None = None) -> Result:
     """Estimate every depth image of a bag; on the CPU twice the same to the last bit.
 
     Of several hands in an image the first one counts, which is the one that has been tracked longest. An image that
@@ -59,8 +68,7 @@ def evaluate_bag(path: str | Path, settings: Settings, progress: Progress | None
 
     Args:
         progress: wraps the frames.
-        hands_bag: write /hand/joints and /hand/skeleton there, with the stamps of the images, to be played beside the
-            original.
+        open_sink: opens what is told the hands of each image, given the skeleton and the metadata of the estimator.
 
     Raises:
         InputError: the bag, the truth or the camera cannot be used, or there is not one image to decode.
@@ -73,15 +81,12 @@ def evaluate_bag(path: str | Path, settings: Settings, progress: Progress | None
     start = time.perf_counter()
     with ExitStack() as stack:
         bag = stack.enter_context(DepthBag(path, **settings.bag))
-        writer = stack.enter_context(BagWriter(hands_bag)) if hands_bag is not None else None
+        sink = stack.enter_context(open_sink(estimator.skeleton, estimator.metadata)) if open_sink else None
         frames: Iterable[tuple[Frame, float]] = _until_damaged(bag, notes)
         for frame, read in progress(frames, len(bag)) if progress else frames:
             hands = record.add(frame, read)
-            if writer:
-                if len(record.stamps) == 1:
-                    writer.write_skeleton(frame.stamp_ns, frame.frame_id, estimator.skeleton,
-                                          str(settings.model or 'default'), estimator.metadata.get('version', ''))
-                writer.write_hands(frame.stamp_ns, frame.frame_id, hands, estimator.skeleton)
+            if sink:
+                sink.add(frame, hands)
     rate = len(record.stamps) / (time.perf_counter() - start)
     if record.intrinsics is None:
         raise InputError(f'{path}: there is no depth image to evaluate'
@@ -101,8 +106,7 @@ def evaluate_bag(path: str | Path, settings: Settings, progress: Progress | None
 
 def evaluate_bags(paths: Sequence[str | Path], settings: Settings, jobs: int | None = None,
                   progress: Progress | None = None,
-                  hands_bags: Mapping[str | Path, str | Path] | None = None
-                  ) -> dict[str | Path, Result | HandPoseError]:
+                  open_sinks: Mapping[str | Path, OpenSink] | None = None) -> dict[str | Path, Result | HandPoseError]:
     """Evaluate many bags at once; one that fails does not stop the others.
 
     Where torchrun has started several processes, on one or more machines, each takes its share of the bags, and the
@@ -111,7 +115,7 @@ def evaluate_bags(paths: Sequence[str | Path], settings: Settings, jobs: int | N
     Args:
         jobs: bags at the same time on this machine; None takes one per core.
         progress: wraps the finished bags.
-        hands_bags: where to write the hands of each bag, see `evaluate_bag`.
+        open_sinks: for each bag, see `evaluate_bag`; sent to other processes.
 
     Returns:
         For each path the result, or what went wrong.
@@ -124,7 +128,7 @@ def evaluate_bags(paths: Sequence[str | Path], settings: Settings, jobs: int | N
     settings = replace(settings, num_threads=settings.num_threads or max(1, cores // workers))
     done: dict[str | Path, Result | HandPoseError] = {}
     with ProcessPoolExecutor(workers, mp_context=get_context('spawn')) as pool:
-        futures = {pool.submit(_attempt, path, settings, (hands_bags or {}).get(path)): path for path in mine}
+        futures = {pool.submit(_attempt, path, settings, (open_sinks or {}).get(path)): path for path in mine}
         finished = as_completed(futures)
         for future in progress(finished, len(futures)) if progress else finished:
             try:
@@ -196,9 +200,9 @@ def _until_damaged(frames: Iterable[Frame], notes: list[str]) -> Iterator[tuple[
         notes.append(f'{error}; only the images before the damage are evaluated.')
 
 
-def _attempt(path: str | Path, settings: Settings, hands_bag: str | Path | None) -> Result | HandPoseError:
+def _attempt(path: str | Path, settings: Settings, open_sink: OpenSink | None) -> Result | HandPoseError:
     try:
-        return evaluate_bag(path, settings, hands_bag=hands_bag)
+        return evaluate_bag(path, settings, open_sink=open_sink)
     except HandPoseError as error:
         return error
 

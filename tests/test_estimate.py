@@ -1,0 +1,219 @@
+"""What `hand-pose estimate` promises: every usable image answered, in files that hold what the estimator said."""
+
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from hand_pose_ros.bags import Bag, BagWriter, read_hands
+from hand_pose_ros.cli import main
+from hand_pose_ros.drawing import FINGER_COLORS, close_up, contact_sheet, overlay, shade
+from hand_pose_ros.estimator import HandPoseEstimator
+from hand_pose_ros.geometry import Cube, Intrinsics
+from hand_pose_ros.models import build
+from hand_pose_ros.models.checkpoints import save_checkpoint
+from hand_pose_ros.skeleton import HAND21
+
+CAMERA = Intrinsics(140.0, 140.0, 80.0, 60.0, 160, 120)
+INTRINSICS = ['--intrinsics', '140', '140', '80', '60']
+STAMPS = [1_700_000_000_000_000_001 + i * 33_000_000 for i in range(6)]
+
+
+@pytest.fixture(scope='module')
+def weights(tmp_path_factory):
+    """A network that has learned nothing: here it matters where its answers go, not what they are."""
+    path = tmp_path_factory.mktemp('weights') / 'untrained.safetensors'
+    save_checkpoint(path, build('deep_prior', joints=21), {'skeleton': 'hand21', 'cube_side': 0.3})
+    return path
+
+
+@pytest.fixture(scope='module')
+def depths():
+    """Something of the size of a hand that comes nearer, before a far wall; whole millimetres, as cameras give them."""
+    v, u = np.mgrid[:120, :160]
+    images = []
+    for i in range(len(STAMPS)):
+        z = 700 - 20 * i
+        disc = np.hypot(u - 60 - 4 * i, v - 60) < 0.06 * 140 / (z / 1000)
+        images.append(np.where(disc, z, 3000).astype(np.uint16) * np.float32(0.001))
+    return images
+
+
+@pytest.fixture
+def folder(tmp_path, depths):
+    """Names that only sort right as numbers."""
+    path = tmp_path / 'frames'
+    path.mkdir()
+    for i, depth in enumerate(depths):
+        cv2.imwrite(str(path / f'{8 + i}.png'), np.rint(depth * 1000).astype(np.uint16))
+    return path
+
+
+@pytest.fixture
+def bag(tmp_path, depths):
+    path = tmp_path / 'bag.mcap'
+    with BagWriter(path) as writer:
+        for stamp, depth in zip(STAMPS, depths, strict=True):
+            writer.write_depth(stamp, 'camera_optical', depth, CAMERA)
+    return path
+
+
+@pytest.fixture
+def command(weights):
+    """Run `hand-pose estimate` with weights that are there; every hand counts."""
+    return lambda *args: main(['estimate', *map(str, args), '--model', str(weights), '--min-score', '0'])
+
+
+@pytest.fixture
+def expected(weights, depths):
+    """What the estimator itself says about the sequence."""
+    estimator = HandPoseEstimator.from_pretrained(weights, min_score=0)
+    return [estimator(depth, CAMERA) for depth in depths]
+
+
+def test_a_folder_of_pngs_into_arrays_and_pictures(tmp_path, folder, command, expected, capsys):
+    assert command(folder, *INTRINSICS, '--out', tmp_path / 'joints.npz', '--overlay', tmp_path / 'pictures') == 0
+    result = np.load(tmp_path / 'joints.npz')
+    assert result['names'].tolist() == ['8', '9', '10', '11', '12', '13']
+    assert result['frame'].tolist() == [i for i, hands in enumerate(expected) for _ in hands] == list(range(6))
+    hands = [hand for hands in expected for hand in hands]
+    # Not bit by bit: a network that runs on several threads may add up in another order each time.
+    np.testing.assert_allclose(result['joints'], [hand.joints for hand in hands], atol=1e-6)
+    np.testing.assert_allclose(result['confidence'], [hand.confidence for hand in hands], atol=1e-4)
+    np.testing.assert_allclose(result['cube_center'], [hand.cube.center for hand in hands], atol=1e-6)
+    assert result['side'].tolist() == [hand.side for hand in hands] and set(result['id']) == {'hand_1'}
+    assert tuple(result['joint_names']) == HAND21.joint_names and str(result['skeleton']) == 'hand21'
+    assert sorted(path.stem for path in (tmp_path / 'pictures').iterdir()) == sorted(result['names'])
+    assert '6 images, 6 with a hand, 0 that could not be used' in capsys.readouterr().out
+
+
+def test_a_bag_into_a_bag(tmp_path, bag, command, expected):
+    assert command(bag, '--out', tmp_path / 'joints.mcap') == 0
+    recorded = read_hands(tmp_path / 'joints.mcap')
+    assert [record.stamp_ns for record in recorded] == STAMPS
+    assert {record.frame_id for record in recorded} == {'camera_optical'}
+    for record, hands in zip(recorded, expected, strict=True):
+        np.testing.assert_allclose(record.joints, [hand.joints for hand in hands], atol=1e-6)
+    with Bag(tmp_path / 'joints.mcap') as result:
+        counts = {connection.topic: connection.msgcount for connection in result.connections}
+    assert counts['/hand/joints'] == 6 and counts['/hand/skeleton'] == 1
+
+
+def test_markers_are_in_the_bag_where_ros_is(tmp_path, bag, command):
+    pytest.importorskip('rclpy', reason='needs ROS 2')
+    command(bag, '--out', tmp_path / 'joints.mcap')
+    with Bag(tmp_path / 'joints.mcap') as result:
+        [markers] = [c for c in result.connections if c.topic == '/hand/markers']
+        assert markers.msgcount == 6
+        [joints] = [m for m in result.first(markers).markers if m.ns == 'hand_1/joints']
+    np.testing.assert_array_equal([(p.x, p.y, p.z) for p in joints.points],
+                                  read_hands(tmp_path / 'joints.mcap')[0].joints[0])
+
+
+def test_images_without_a_hand_are_answered_too(tmp_path, bag, weights):
+    args = ['estimate', str(bag), '--model', str(weights), '--min-score', '1.1']
+    assert main([*args, '--out', str(tmp_path / 'a.mcap')]) == main([*args, '--out', str(tmp_path / 'a.npz')]) == 0
+    assert [len(record.joints) for record in read_hands(tmp_path / 'a.mcap')] == [0] * 6
+    result = np.load(tmp_path / 'a.npz')
+    assert result['joints'].shape == (0, 21, 3) and result['stamp_ns'].tolist() == STAMPS
+
+
+def test_a_bad_file_is_reported_and_the_rest_goes_on(tmp_path, folder, command, capsys):
+    cv2.imwrite(str(folder / '9.png'), np.zeros((120, 160), np.uint8))
+    assert command(folder, *INTRINSICS, '--out', tmp_path / 'joints.npz') == 1
+    assert np.load(tmp_path / 'joints.npz')['names'].tolist() == ['8', '10', '11', '12', '13']
+    said = capsys.readouterr()
+    assert '9.png: the PNG has 8 bits' in said.err and '1 that could not be used' in said.out
+
+
+def test_what_comes_before_the_damage_of_a_bag_counts(tmp_path, bag, command, capsys):
+    with BagWriter(tmp_path / 'long.mcap') as writer:
+        noise = np.random.default_rng(0).integers(500, 4000, (120, 160), np.uint16) * np.float32(0.001)
+        for i in range(60):
+            writer.write_depth(STAMPS[0] + i, 'camera', noise, CAMERA, codec=None)
+    data = (tmp_path / 'long.mcap').read_bytes()
+    (tmp_path / 'cut.mcap').write_bytes(data[:int(len(data) * 0.9)])
+    assert command(tmp_path / 'cut.mcap', '--out', tmp_path / 'joints.npz') == 1
+    assert 0 < len(np.load(tmp_path / 'joints.npz')['names']) < 60
+    assert 'cut.mcap: the bag was cut short' in capsys.readouterr().err
+
+
+def test_nothing_usable_writes_nothing(tmp_path, command, capsys):
+    (tmp_path / 'frames').mkdir()
+    (tmp_path / 'frames/0.png').write_text('no picture')
+    assert command(tmp_path / 'frames', *INTRINSICS, '--out', tmp_path / 'joints.mcap') == 1
+    assert not (tmp_path / 'joints.mcap').exists()
+    assert 'none of the images could be used' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('args', [(), (*INTRINSICS, '--out', 'joints.csv'), ('--intrinsics', '1', '2', '3')])
+def test_bad_arguments_exit_with_2(folder, command, args):
+    with pytest.raises(SystemExit) as leaving:
+        command(folder, *args)
+    assert leaving.value.code == 2
+
+
+@pytest.mark.parametrize('name', ['missing.mcap', 'missing.png', '.'])
+def test_a_missing_input_exits_with_1_and_names_it(tmp_path, command, capsys, name):
+    assert command(tmp_path / name, *INTRINSICS) == 1
+    assert str(tmp_path / name) in capsys.readouterr().err
+
+
+def test_depth_scale_and_real_frames(tmp_path, shared_data, command):
+    args = ('--intrinsics', 476.007, 476.007, 313.683, 242.755, '--depth-scale', 0.000125, '--out', tmp_path / 'a.npz')
+    assert command(shared_data / 'frames/sr305/20210326-230536', *args) == 0
+    result = np.load(tmp_path / 'a.npz')
+    assert result['names'].tolist() == ['30', '50', '70', '90', '110', '130', '150', '170']
+    assert ((result['cube_center'][:, 2] > 0.4) & (result['cube_center'][:, 2] < 0.7)).all()
+
+
+@pytest.fixture
+def drawn():
+    """A hand before a wall, with one joint in each finger where it can be told apart."""
+    joints = np.zeros((21, 3), np.float32)
+    joints[:, 2] = 0.5
+    for finger in range(5):
+        for k in range(4):
+            joints[1 + 4 * finger + k] = (-0.08 + 0.04 * finger, 0.04 - 0.03 * k, 0.5)
+    joints[0] = (0.0, 0.08, 0.5)
+    camera = Intrinsics(400.0, 400.0, 170.0, 110.0, 320, 240)
+    depth = np.full((240, 320), 0.52, np.float32)
+    depth[:, :20] = 0
+    hand = SimpleNamespace(joints=joints, cube=Cube((0.0, 0.0, 0.5), 0.3), side='left', score=0.5, id='a',
+                           confidence=np.ones(21, np.float32))
+    return depth, camera, hand
+
+
+def color_at(picture, point, camera):
+    u, v = camera.project(point).round().astype(int)
+    return tuple(picture[v, u, ::-1].tolist())
+
+
+def test_joints_are_drawn_where_they_are_in_the_colour_of_their_finger(drawn):
+    depth, camera, hand = drawn
+    picture = overlay(depth, camera, [hand], height=480)
+    assert picture.shape == (480, 640 + 480, 3)
+    twice = Intrinsics(800.0, 800.0, 2 * 170.5 - 0.5, 2 * 110.5 - 0.5, 640, 480)
+    # The close-up shows the cube: its centre in the middle, its side as wide as the picture.
+    cube = Intrinsics(800.0, 800.0, 239.5, 239.5, 480, 480)
+    for tip in HAND21.tips:
+        color = FINGER_COLORS[HAND21.fingers[tip]]
+        assert color_at(picture, hand.joints[tip], twice) == color
+        assert color_at(picture[:, 640:], hand.joints[tip], cube) == color
+        assert color_at(close_up(depth, camera, hand), hand.joints[tip], cube) == color
+
+
+def test_nothing_is_dark_and_near_is_brighter_than_far():
+    camera = Intrinsics(400.0, 400.0, 160.0, 120.0, 320, 240)
+    depth = np.full((240, 320), 1.0, np.float32)
+    depth[:, :100], depth[:, 220:] = 0.5, 0
+    picture = shade(depth, camera).astype(int).sum(axis=2)
+    assert picture[120, 50] > picture[120, 160] > picture[120, 270]
+    assert shade(np.zeros((4, 4), np.float32), camera).max() < 40
+
+
+def test_a_contact_sheet_is_read_like_text():
+    sheet = contact_sheet([np.full((2, 3, 3), value, np.uint8) for value in (50, 100, 150)], columns=2)
+    assert sheet.shape == (4, 6, 3)
+    assert (sheet[0, 0, 0], sheet[0, 3, 0], sheet[2, 0, 0]) == (50, 100, 150)

@@ -1,0 +1,189 @@
+"""What `replay` promises: a bag on ROS topics as it was recorded. The real node, over real DDS."""
+
+import time
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip('rclpy', reason='needs ROS 2')
+pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
+
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
+from rosgraph_msgs.msg import Clock  # noqa: E402
+from sensor_msgs.msg import CameraInfo, Image  # noqa: E402
+from std_srvs.srv import SetBool  # noqa: E402
+from test_bags import CAMERA, STAMPS, write_ros1  # noqa: E402
+
+from hand_pose_ros.bags import Bag, BagWriter  # noqa: E402
+from hand_pose_ros.cli import main  # noqa: E402
+from hand_pose_ros.depth import decode_image  # noqa: E402
+from hand_pose_ros.errors import InputError  # noqa: E402
+from hand_pose_ros.msg import HandSkeleton  # noqa: E402
+from hand_pose_ros.ros.replay import Replay  # noqa: E402
+from hand_pose_ros.skeleton import HAND21  # noqa: E402
+
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+@pytest.fixture(scope='module')
+def depths():
+    units = np.random.default_rng(3).integers(0, 4000, (len(STAMPS), 48, 64), np.uint16)
+    return [image * np.float32(0.001) for image in units]
+
+
+@pytest.fixture
+def bag(tmp_path, depths):
+    path = tmp_path / 'bag.mcap'
+    with BagWriter(path) as writer:
+        writer.write_skeleton(STAMPS[0], 'camera', HAND21, 'a network', '1')
+        for stamp, depth in zip(STAMPS, depths, strict=True):
+            writer.write_depth(stamp, 'camera', depth, CAMERA, codec=None)
+    return path
+
+
+class Listener:
+    """Collects what is published; its node spins whenever `until` waits."""
+
+    def __init__(self):
+        self.node = rclpy.create_node('listener')
+        self.executor = SingleThreadedExecutor()
+        self.executor.add_node(self.node)
+        self.heard = {}
+
+    def on(self, topic, kind, qos=50):
+        self.heard[topic] = []
+        self.node.create_subscription(kind, topic, self.heard[topic].append, qos)
+        return self
+
+    def until(self, condition, seconds=10.0):
+        end = time.monotonic() + seconds
+        while not condition() and time.monotonic() < end:
+            self.executor.spin_once(timeout_sec=0.05)
+        return condition()
+
+
+@pytest.fixture
+def listener(ros_domain):
+    rclpy.init()
+    yield Listener()
+    rclpy.try_shutdown()
+
+
+@pytest.fixture
+def play():
+    """Open a bag and a Replay of it; closed at the end."""
+    opened = []
+
+    def make(path, **options):
+        bag = Bag(path)
+        opened.append(bag)
+        replay = Replay(bag, **options)
+        opened.append(replay)
+        return replay
+    yield make
+    for each in reversed(opened):
+        each.close()
+
+
+def stamps(messages):
+    return [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in messages]
+
+
+def test_types_stamps_and_content_are_those_of_the_recording(bag, depths, listener, play):
+    listener.on('/depth/image_rect', Image).on('/depth/camera_info', CameraInfo)
+    listener.on('/hand/skeleton', HandSkeleton, LATCHED)
+    replay = play(bag, rate=4)
+    replay.wait_for_subscribers(5)
+    replay.play()
+    images, infos = listener.heard['/depth/image_rect'], listener.heard['/depth/camera_info']
+    assert listener.until(lambda: len(images) == len(infos) == len(STAMPS) and listener.heard['/hand/skeleton'])
+    assert stamps(images) == stamps(infos) == STAMPS
+    assert {image.header.frame_id for image in images} == {'camera'}
+    for image, depth in zip(images, depths, strict=True):
+        np.testing.assert_array_equal(decode_image(image), depth)
+    assert replay.published == {'/depth/image_rect': 12, '/depth/camera_info': 12, '/hand/skeleton': 1}
+
+
+def test_ros1_bags_become_ros2_messages(tmp_path, depths, listener, play):
+    listener.on('/cam/image', Image).on('/cam/camera_info', CameraInfo)
+    replay = play(write_ros1(tmp_path / 'old.bag', depths), rate=4)
+    replay.wait_for_subscribers(5)
+    replay.play()
+    images, infos = listener.heard['/cam/image'], listener.heard['/cam/camera_info']
+    assert listener.until(lambda: len(images) == len(infos) == len(STAMPS))
+    assert stamps(images) == stamps(infos) == STAMPS
+    np.testing.assert_array_equal(decode_image(images[5]), depths[5])
+    assert infos[0].k[0] == CAMERA.fx and infos[0].p[5] == CAMERA.fy and infos[0].width == 64
+
+
+def test_the_latched_skeleton_reaches_who_comes_later(bag, listener, play):
+    replay = play(bag, topics=['/hand/skeleton'])
+    replay.wait_for_subscribers(0)
+    replay.play()
+    listener.on('/hand/skeleton', HandSkeleton, LATCHED)
+    assert listener.until(lambda: listener.heard['/hand/skeleton'])
+    assert tuple(listener.heard['/hand/skeleton'][0].joint_names) == HAND21.joint_names
+
+
+def test_start_rate_and_topics(bag, listener, play):
+    listener.on('/depth/image_rect', Image).on('/depth/camera_info', CameraInfo)
+    replay = play(bag, topics=['/depth/image_rect'], rate=0.5)
+    replay.wait_for_subscribers(5)
+    began = time.monotonic()
+    replay.play(start_s=0.264)  # the last four images, 33 ms apart
+    assert time.monotonic() - began >= 3 * 0.033 / 0.5
+    assert listener.until(lambda: len(listener.heard['/depth/image_rect']) == 4)
+    assert stamps(listener.heard['/depth/image_rect']) == STAMPS[8:]
+    assert not listener.heard['/depth/camera_info']
+    with pytest.raises(InputError, match=r'nothing was recorded later than 99 s'):
+        replay.play(start_s=99)
+
+
+def test_the_clock_tells_the_time_of_recording(bag, listener, play):
+    listener.on('/clock', Clock).on('/depth/image_rect', Image)
+    replay = play(bag, clock=True)
+    replay.wait_for_subscribers(5)
+    replay.play()
+    assert listener.until(lambda: len(listener.heard['/depth/image_rect']) == len(STAMPS))
+    listener.until(lambda: False, seconds=0.2)
+    times = [m.clock.sec * 10**9 + m.clock.nanosec for m in listener.heard['/clock']]
+    assert len(times) >= len(STAMPS) and times == sorted(times)
+    assert STAMPS[0] <= times[0] and times[-1] == STAMPS[-1]
+
+
+def test_pause_by_service(bag, listener, play):
+    replay = play(bag, paused=True, topics=['/depth/image_rect'], rate=10)
+    client = listener.node.create_client(SetBool, '/replay/pause')
+    answer = []
+
+    def go_on():
+        # Played from within the loop of the replay, which waits: the timer stands for another terminal.
+        if client.service_is_ready() and not answer:
+            answer.append(client.call_async(SetBool.Request(data=False)))
+    replay.node.create_timer(0.3, go_on)
+    began = time.monotonic()
+    replay.play()
+    assert time.monotonic() - began >= 0.25 and replay.published['/depth/image_rect'] == 12
+    assert listener.until(lambda: answer[0].done()) and answer[0].result().message == 'playing'
+
+
+def test_best_effort_on_request(bag, listener, play):
+    replay = play(bag, reliability='best_effort')
+    [info] = replay.node.get_publishers_info_by_topic('/depth/image_rect')
+    assert info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+
+
+def test_topics_that_are_not_there_are_named(bag, listener, play):
+    with pytest.raises(InputError, match=r'cannot publish /depth/imaje: choose from .*/depth/image_rect'):
+        play(bag, topics=['/depth/imaje'])
+
+
+def test_the_command_publishes_and_counts(bag, ros_domain, capsys):
+    assert main(['replay', str(bag), '--rate', '100', '--wait', '0', '--ros-args', '-r', '__ns:=/robot']) == 0
+    assert '12  /depth/image_rect' in capsys.readouterr().out
+    assert main(['replay', str(bag.with_name('missing.bag'))]) == 1
+    assert 'missing.bag: there is no such bag' in capsys.readouterr().err
+    with pytest.raises(SystemExit) as leaving:
+        main(['replay', str(bag), '--rate', '0'])
+    assert leaving.value.code == 2

@@ -5,13 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hand_pose_ros.synthetic.kinematics import INDEX, POSE, forward
+from hand_pose_ros.synthetic.kinematics import INDEX, POSE, place_bones
 from hand_pose_ros.synthetic.shapes import Shape, mean_shape
 
 TOLERANCE, SQUEEZE = 0.002, 0.0045
 """Metres by which capsules may overlap: flesh gives way where parts touch, more so between neighbouring fingers."""
 
-_ROUNDS = 14
+_ROUNDS = 10
 
 # Capsules: 0-2 thumb, 3-14 index to little finger (three each), 15-18 the palm along the metacarpals.
 _PAIRS = torch.tensor(
@@ -25,10 +25,9 @@ _GIVE = torch.where((_FINGER[_PAIRS].min(1).values > 0) & (_FINGER[_PAIRS].max(1
 
 def _capsules(shape: Shape, pose: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Ends (B, 19, 3) and (B, 19, 3) and radii (B, 19) of the capsules."""
-    rotations, origins, joints = forward(shape, pose, torch.zeros_like(pose[0]))
-    digits = joints[:, 1:].reshape(-1, 5, 4, 3)
-    inwards = shape.palm_depth[:, None, None] * rotations[:, 3:7, :, 2]  # (B, 4, 3)
-    start = torch.cat([digits[:, :, :3].reshape(-1, 15, 3), origins[:, 3:7] + 0.35 * inwards], 1)
+    metacarpals, bases, _, digits = place_bones(shape, pose)
+    inwards = shape.palm_depth[:, None, None] * metacarpals[..., 2]  # (B, 4, 3)
+    start = torch.cat([digits[:, :, :3].reshape(-1, 15, 3), bases + 0.35 * inwards], 1)
     end = torch.cat([digits[:, :, 1:].reshape(-1, 15, 3), digits[:, 1:, 0] + 0.18 * inwards], 1)
     radii = shape.radii * shape.radii.new_tensor([[0.8, 1, 0.95], *[[0.96, 1, 0.95]] * 4])
     palm = 0.74 * shape.palm_depth[:, None].expand(-1, 4)
@@ -69,36 +68,44 @@ def overlaps(pose: Tensor, shape: Shape | None = None) -> Tensor:
 def part_contacts(pose: Tensor) -> Tensor:
     """Poses (B, P) near the given ones in which nothing overlaps (see `overlaps`), for the average hand.
 
-    The thumb is moved outwards, fingers that meet the palm open, fingers that meet each other come side by side. What is
-    still entangled after some rounds gives way towards an open hand.
+    The thumb is moved outwards, fingers that meet the palm open, fingers that meet each other come side by side. What
+    is still entangled after some rounds gives way towards an open hand.
     """
-    pose = pose.clone()
-    open_thumb = torch.deg2rad(pose.new_tensor([46, 34, 80, 0, 4, 0]))
-    thumb = slice(INDEX['thumb_cmc_radial'], INDEX['thumb_ip_flexion'] + 1)
-    fingers = slice(INDEX['index_mcp_flexion'], len(POSE))
-    calm = torch.zeros(4, device=pose.device)
-    for _ in range(_ROUNDS):
-        deep = overlaps(pose)
-        if not (deep > 0).any():
-            return pose
-        amount = (deep / 0.012).clamp(0.08, 0.5) * (deep > 0)
-        by_thumb = amount[:, 0, 1:].amax(1, keepdim=True)
-        pose[:, thumb] = torch.lerp(pose[:, thumb], open_thumb, by_thumb)
-        digits = pose[:, fingers].reshape(-1, 4, 4)  # (B, finger, angle)
-        between = amount[:, 1:5, 1:5]
-        strength = between.amax(2)
-        partner = (between @ digits[..., 0::2]) / between.sum(2, keepdim=True).clamp(1e-6)  # what the others bend by
-        mean_bend = torch.where(strength[..., None] > 0, partner, digits[..., 0::2])
-        bend = torch.lerp(digits[..., 0::2], mean_bend, 0.5 * strength[..., None])
-        opening = 1 - 0.35 * amount[:, 1:5, 5].maximum(amount[:, 1:5, 0] * 0.3)
-        abduct = torch.lerp(digits[..., 1], calm, strength)
-        digits = torch.stack([bend[..., 0] * opening, abduct, bend[..., 1] * opening, digits[..., 3] * opening], -1)
-        pose[:, fingers] = digits.reshape(-1, 16)
-    stuck = (overlaps(pose) > 0).flatten(1).any(1)
-    harmless = torch.zeros_like(pose[0])
-    harmless[thumb] = open_thumb
-    harmless = torch.cat([pose[:, :4], harmless[4:].expand(len(pose), -1)], 1)
-    for part in (0.5, 1.0):
-        pose = torch.where(stuck[:, None], torch.lerp(pose, harmless, part), pose)
-        stuck = (overlaps(pose) > 0).flatten(1).any(1)
+    pose, still = pose.clone(), torch.arange(len(pose), device=pose.device)
+    for turn in range(_ROUNDS + 2):
+        deep = overlaps(pose[still])
+        touching = (deep > 0).flatten(1).any(1)
+        still, deep = still[touching], deep[touching]
+        if not len(still):
+            break
+        if turn < _ROUNDS:
+            pose[still] = _nudge(pose[still], deep)
+        else:
+            pose[still, 4:] = torch.lerp(pose[still, 4:], _open_hand(pose)[4:], 0.5 if turn == _ROUNDS else 1.0)
     return pose
+
+
+_THUMB = slice(INDEX['thumb_cmc_radial'], INDEX['thumb_ip_flexion'] + 1)
+_FINGERS = slice(INDEX['index_mcp_flexion'], len(POSE))
+
+
+def _open_hand(like: Tensor) -> Tensor:
+    """(P,) a pose in which nothing can meet: straight fingers, the thumb off the palm."""
+    pose = torch.zeros_like(like[0])
+    pose[_THUMB] = torch.deg2rad(like.new_tensor([46, 34, 80, 0, 4, 0]))
+    return pose
+
+
+def _nudge(pose: Tensor, deep: Tensor) -> Tensor:
+    """One step of poses (B, P) away from their overlaps (B, 6, 6)."""
+    amount = (deep / 0.010).clamp(0.12, 0.6) * (deep > 0)
+    thumb = torch.lerp(pose[:, _THUMB], _open_hand(pose)[_THUMB], amount[:, 0, 1:].amax(1, keepdim=True))
+    fingers = pose[:, _FINGERS].reshape(-1, 4, 4)  # MCP flexion and abduction, PIP and DIP flexion
+    between = amount[:, 1:5, 1:5]
+    strength = between.amax(2)[..., None]
+    beside = (between @ fingers) / between.sum(2, keepdim=True).clamp(1e-6)  # how the fingers that it meets are bent
+    bend = torch.lerp(fingers, beside, 0.5 * strength)
+    opening = 1 - torch.maximum(0.35 * amount[:, 1:5, 5], 0.1 * amount[:, 1:5, 0])[..., None]
+    fingers = torch.stack([bend[..., 0:1] * opening, fingers[..., 1:2] * (1 - strength), bend[..., 2:3] * opening,
+                           fingers[..., 3:4] * opening], -2)
+    return torch.cat([pose[:, :_THUMB.start], thumb, fingers.reshape(-1, 16)], 1)

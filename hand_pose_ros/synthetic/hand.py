@@ -64,16 +64,20 @@ class SkinnedHand(nn.Module):
         self.register_buffer('_to_bone', rotations.mT / sizes[..., None])  # rest position -> bone, in bone sizes
         self.register_buffer('_origins', origins.clone())
         ones = torch.cat([vertices, torch.ones(len(vertices), 1)], 1)
-        # (V, 4K): weight times homogeneous position, so that skinning is one matrix product.
-        self.register_buffer('_basis', (weights[:, :, None] * ones[:, None]).reshape(len(vertices), -1))
+        # (4K, V): weight times homogeneous position, so that skinning is one matrix product.
+        self.register_buffer('_basis', (weights[:, :, None] * ones[:, None]).reshape(len(vertices), -1).T.contiguous())
 
     def forward(self, shape: Shape, pose: Tensor) -> tuple[Tensor, Tensor]:
         """Shape of B hands and pose (B, P) in radians -> skin (B, V, 3) and joints hand21 (B, 21, 3), in metres."""
         rotations, origins, joints = forward(shape, pose, self.rest)
         linear = (rotations * bone_sizes(shape)[:, :, None]) @ self._to_bone  # (B, K, 3, 3)
         shift = origins - (linear @ self._origins[..., None])[..., 0]
-        transforms = torch.cat([linear, shift[..., None]], -1).transpose(2, 3).reshape(len(pose), -1, 3)  # (B, 4K, 3)
-        return torch.matmul(self._basis, transforms), joints
+        transforms = torch.cat([linear, shift[..., None]], -1).transpose(1, 2).reshape(3 * len(pose), -1)  # (3B, 4K)
+        # Padded to a multiple of 8 hands: a product of few rows is summed in another order than one of many, and a hand
+        # must not depend on the batch it is in.
+        padded = nn.functional.pad(transforms, (0, 0, 0, -len(transforms) % 24))
+        skin = (padded @ self._basis)[:len(transforms)].reshape(len(pose), 3, -1)
+        return skin.transpose(1, 2).contiguous(), joints
 
 
 class HandModel(SkinnedHand):

@@ -47,10 +47,14 @@ def _axis_rotation(axis: int, angle: Tensor) -> Tensor:
     return torch.stack(rows, -1).reshape(*angle.shape, 3, 3)
 
 
-def _joint_rotations(pose: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Pose (B, P) -> wrist (B,3,3), ring and little CMC in (B,4,3,3), first, second, third joint of the digits (B,5,3,3)."""
+def _wrist_rotation(pose: Tensor) -> Tensor:
+    """(B, 3, 3): how the forearm turns while the hand stays."""
+    return _axis_rotation(0, -pose[:, INDEX['wrist_flexion']]) @ _axis_rotation(2, pose[:, INDEX['wrist_deviation']])
+
+
+def _joint_rotations(pose: Tensor) -> tuple[Tensor, list[Tensor]]:
+    """Of ring and little finger CMC within (B, 4, 3, 3); of first, second and third joint of the digits (B, 5, 3, 3)."""
     angle = {name: pose[:, i] for name, i in INDEX.items()}
-    wrist = _axis_rotation(0, -angle['wrist_flexion']) @ _axis_rotation(2, angle['wrist_deviation'])
     still = torch.zeros_like(pose[:, 0])
     cmc = _axis_rotation(0, torch.stack([still, still, angle['ring_cmc_flexion'], angle['pinky_cmc_flexion']], -1))
 
@@ -63,7 +67,7 @@ def _joint_rotations(pose: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tens
     thumb3 = _axis_rotation(0, angle['thumb_ip_flexion'])
     digits = [torch.cat([thumb[:, None], finger], 1) for thumb, finger in (
         (thumb1, finger1), (thumb2, _axis_rotation(0, fingers[..., 2])), (thumb3, _axis_rotation(0, fingers[..., 3])))]
-    return wrist, cmc, *digits
+    return cmc, digits
 
 
 def metacarpal_bases(shape: Shape) -> Tensor:
@@ -73,8 +77,35 @@ def metacarpal_bases(shape: Shape) -> Tensor:
     return torch.stack([roots[..., 0] * x, roots[..., 1] * y, roots[..., 2] * 0.3], -1)
 
 
+def place_bones(shape: Shape, pose: Tensor) -> tuple[Tensor, Tensor, list[Tensor], Tensor]:
+    """Where pose (B, P) carries the bones of B hands (or of one, for all).
+
+    Returns:
+        Rotations of the metacarpals (B, 4, 3, 3) and their origins (B, 4, 3), index to little finger; for what the
+        digits hang on and their three bones a rotation (B, 5, 3, 3) each; joints of the digits (B, 5, 4, 3), tips last.
+    """
+    batch = len(pose)
+    cmc, turns = _joint_rotations(pose)
+    degrees = torch.pi / 180
+    base = _axis_rotation(2, pose.new_tensor(_SPLAY) * degrees) @ _axis_rotation(1, pose.new_tensor(_LEAN) * degrees)
+    roots, bases = shape.roots.expand(batch, 5, 3), metacarpal_bases(shape).expand(batch, 4, 3)
+    along = roots[:, 1:] - bases
+    # Metacarpal frames: y from CMC to MCP, so that they can be stretched along the bone.
+    yaw, pitch = torch.atan2(-along[..., 0], along[..., 1]), torch.atan2(along[..., 2], along[..., :2].norm(dim=-1))
+    metacarpal = cmc @ _axis_rotation(2, yaw) @ _axis_rotation(0, pitch)
+
+    point = torch.cat([roots[:, :1], bases + (cmc @ along[..., None])[..., 0]], 1)
+    rotations = [torch.cat([torch.eye(3, device=pose.device).expand(batch, 1, 3, 3), cmc @ base], 1)]
+    points = [point]
+    for i, turn in enumerate(turns):
+        rotations.append(rotations[-1] @ turn)
+        point = point + rotations[-1][..., 1] * shape.segments[..., i:i + 1]
+        points.append(point)
+    return metacarpal, bases, rotations, torch.stack(points, 2)
+
+
 def forward(shape: Shape, pose: Tensor, rest: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Where the bones are.
+    """The frames that carry the skin, and the joints.
 
     Args:
         shape: B hands (or one for all).
@@ -82,38 +113,20 @@ def forward(shape: Shape, pose: Tensor, rest: Tensor) -> tuple[Tensor, Tensor, T
         rest: (P,) the pose from which the 'joint' frames turn half-way.
 
     Returns:
-        Rotations (B, K, 3, 3) from the frame of each bone (y along the bone, z palmar) to the hand frame; origins
-        (B, K, 3) in metres; joints (B, 21, 3) in the order of hand21, in metres.
+        Rotations (B, K, 3, 3) from the frame of each of the `BONES` (y along the bone, z palmar) to the hand frame;
+        origins (B, K, 3) in metres; joints (B, 21, 3) in the order of hand21, in metres.
     """
     batch = len(pose)
-    wrist, cmc, *turns = _joint_rotations(pose)
-    half_wrist, _, *half_turns = _joint_rotations((pose + rest) / 2)
-    degrees = torch.pi / 180
-    base = _axis_rotation(2, pose.new_tensor(_SPLAY) * degrees) @ _axis_rotation(1, pose.new_tensor(_LEAN) * degrees)
-    identity = torch.eye(3, device=pose.device).expand(batch, 1, 3, 3)
-
-    roots, bases = shape.roots.expand(batch, 5, 3), metacarpal_bases(shape).expand(batch, 4, 3)
-    along = roots[:, 1:] - bases
-    origins = torch.cat([roots[:, :1], bases + (cmc @ along[..., None])[..., 0]], 1)  # of the digits
-    parent = torch.cat([identity, cmc @ base], 1)
-    # Metacarpal frames: y from CMC to MCP, so that they can be stretched along the bone.
-    yaw, pitch = torch.atan2(-along[..., 0], along[..., 1]), torch.atan2(along[..., 2], along[..., :2].norm(dim=-1))
-    metacarpal = cmc @ _axis_rotation(2, yaw) @ _axis_rotation(0, pitch)
-
+    metacarpal, bases, bones, digits = place_bones(shape, pose)
+    half = (pose + rest) / 2
+    wrist, half_wrist = _wrist_rotation(pose), _wrist_rotation(half)
     zero = torch.zeros(batch, 1, 3, device=pose.device)
-    rotations, places = [wrist[:, None], half_wrist[:, None], identity, metacarpal], [zero, zero, zero, bases]
-    digit_rotations, digit_places, joints = [], [], [origins]
-    segments = shape.segments.expand(batch, 5, 3)
-    for i, (turn, half) in enumerate(zip(turns, half_turns, strict=True)):
-        digit_rotations += [parent @ half, parent @ turn]
-        digit_places += [origins, origins]
-        parent = parent @ turn
-        origins = origins + parent[..., 1] * segments[..., i:i + 1]
-        joints.append(origins)
-    rotations.append(torch.stack(digit_rotations, 2).reshape(batch, 30, 3, 3))
-    places.append(torch.stack(digit_places, 2).reshape(batch, 30, 3))
-    return (torch.cat(rotations, 1), torch.cat(places, 1),
-            torch.cat([zero, torch.stack(joints, 2).reshape(batch, 20, 3)], 1))
+    middle = [parent @ turn for parent, turn in zip(bones, _joint_rotations(half)[1], strict=False)]
+    both = [rotation for pair in zip(middle, bones[1:], strict=True) for rotation in pair]
+    rotations = [wrist[:, None], half_wrist[:, None], torch.eye(3, device=pose.device).expand(batch, 1, 3, 3), metacarpal,
+                 torch.stack(both, 2).reshape(batch, 30, 3, 3)]
+    origins = [zero, zero, zero, bases, digits[:, :, :3].repeat_interleave(2, 2).reshape(batch, 30, 3)]
+    return torch.cat(rotations, 1), torch.cat(origins, 1), torch.cat([zero, digits.reshape(batch, 20, 3)], 1)
 
 
 def bone_sizes(shape: Shape) -> Tensor:

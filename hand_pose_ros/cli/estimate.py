@@ -45,7 +45,8 @@ _PNG_PERIOD_NS = 33_333_333
 def add_parser(subparsers: Any) -> None:
     """Declare the verb."""
     parser = subparsers.add_parser(
-        'estimate', help='joints and pictures from a bag or from 16-bit depth PNGs', description='The joints of every depth image of a bag or a folder, as numbers, as a bag, as pictures.',
+        'estimate', help='joints and pictures from a bag or from 16-bit depth PNGs',
+        description='The joints of every depth image of a bag or a folder, as numbers, as a bag and as pictures.',
         epilog=_EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('input', metavar='INPUT', type=Path, help='a bag (ROS 1, sqlite3, MCAP), a 16-bit depth PNG, '
                         'or a folder of them')

@@ -1,0 +1,171 @@
+"""Reports and comparisons: what is in them, and that a real browser shows and turns it."""
+
+import json
+import re
+import shutil
+import subprocess
+
+import cv2
+import numpy as np
+import pytest
+
+from hand_pose_ros.cli import main
+from hand_pose_ros.evaluation import metrics, plots
+from hand_pose_ros.evaluation.report import write_report
+from hand_pose_ros.evaluation.results import Result
+from hand_pose_ros.geometry import Intrinsics
+from hand_pose_ros.skeleton import HAND21
+
+CAMERA = Intrinsics(400, 400, 159.5, 119.5, 320, 240)
+
+
+def flat_hand(rng):
+    """A hand with spread fingers, about 18 cm long, half a metre away."""
+    joints = np.zeros((21, 3))
+    for finger, angle in enumerate(np.radians([-60, -18, 0, 14, 30])):
+        reach = np.array([0.03, 0.06, 0.09, 0.11]) if finger == 0 else np.array([0.085, 0.125, 0.15, 0.17])
+        joints[1 + 4 * finger:5 + 4 * finger] = reach[:, None] * [np.sin(angle), -np.cos(angle), 0]
+    return joints + np.array([0, 0.08, 0.5]) + rng.normal(0, 0.02, 3)
+
+
+@pytest.fixture
+def result():
+    rng = np.random.default_rng(0)
+    truth = np.stack([flat_hand(rng) for _ in range(40)])
+    predictions = truth + rng.normal(0, 0.004, truth.shape) * np.linspace(0.1, 3, 40)[:, None, None]
+    predictions[7] = np.nan
+    return Result('ours <&> others', HAND21, CAMERA, predictions, truth, 33_000_000 * np.arange(40),
+                  {'predict': rng.uniform(0.001, 0.002, 40), 'total': rng.uniform(0.003, 0.004, 40)},
+                  notes=('one image was <odd>',), info={'model': 'm', 'frames_per_s': 321.0})
+
+
+def depth_images(result):
+    """A disc of 4 cm around each true joint, before a wall."""
+    def read(rows):
+        images = {}
+        for row in rows:
+            image = np.full((240, 320), 1.2, np.float32)
+            for (u, v), (_, _, z) in zip(CAMERA.project(result.truth[row]), result.truth[row], strict=True):
+                cv2.circle(image, (round(u), round(v)), 12, float(z), -1)
+            images[row] = image
+        return images
+    return read
+
+
+def test_report_is_one_file_that_needs_nothing_else(result, tmp_path):
+    path = write_report([result], tmp_path / 'out', depth_images(result))
+    html = path.read_text()
+    outside = re.sub(r'base64,[A-Za-z0-9+/=]+', '', html)
+    assert not re.search(r'https?://|<link|@import|url\(|src="(?!data:)', outside)
+    assert '<odd>' not in html and '<&>' not in html, 'what users name is escaped'
+    summary = result.summary()
+    assert f'{summary["mean_mm"]:.3f}' in html and f'{100 * summary["within_mm"]["20"]:.2f}' in html
+    assert {file.name for file in path.parent.iterdir()} == {'report.html', *(
+        f'{name}.{form}' for name in ('curves', 'joints', 'errors', 'latency') for form in ('png', 'svg'))}
+    for image in path.parent.glob('*.png'):
+        assert cv2.imread(str(image)).std() > 10
+
+
+def test_report_shows_the_best_median_and_worst_frame(result, tmp_path):
+    html = write_report([result], tmp_path, depth_images(result)).read_text()
+    means = metrics.frame_means_mm(result.errors_mm)
+    order = [row for row in np.argsort(means) if np.isfinite(means[row])]
+    titles = re.findall(r'<h3>(\w+): frame (\d+), ([\d.]+) mm</h3>', html)
+    assert [(name, int(row) - 1) for name, row, _ in titles] == [
+        ('Best', order[0]), ('Median', order[19]), ('Worst', order[-1])]
+    views = json.loads(re.search(r'id="frames">(.*?)</script>', html)[1])['views']
+    assert len(views) == 3 and all(len(view['cloud']) > 600 and len(view['estimate']) == 21 for view in views)
+    gap = np.linalg.norm(np.subtract(views[2]['estimate'], views[2]['truth']), axis=1).mean()
+    assert gap == pytest.approx(means[order[-1]], abs=0.1), 'the view has the scale of the world'
+
+
+def test_report_without_truth_shows_times_and_first_middle_last(result, tmp_path):
+    blind = Result('b', HAND21, CAMERA, result.predictions, stamps_ns=result.stamps_ns, seconds=result.seconds)
+    html = write_report([blind], tmp_path).read_text()
+    assert re.findall(r'<h3>(\w+): frame (\d+)</h3>', html) == [('First', '1'), ('Middle', '21'), ('Last', '40')]
+    assert 'latency, 99th percentile' in html and 'Accuracy' not in html
+
+
+def test_report_of_nothing_found_can_be_written(result, tmp_path):
+    nothing = Result('n', HAND21, CAMERA, np.full((3, 21, 3), np.nan), result.truth[:3])
+    assert '<canvas data-view' not in write_report([nothing], tmp_path).read_text()
+
+
+def test_curves_show_what_the_metrics_say(result):
+    left, right = plots.curves([result]).axes
+    for axes, curve in ((left, metrics.success_curve), (right, metrics.pck)):
+        line = axes.lines[0]
+        assert line.get_ydata() == pytest.approx(100 * curve(result.errors_mm, line.get_xdata()))
+    bars = [bar.get_height() for bar in plots.joint_bars([result]).axes[0].patches]
+    assert bars == pytest.approx(metrics.per_joint_mm(result.errors_mm))
+
+
+@pytest.fixture(scope='session')
+def chromium():
+    found = next(filter(None, map(shutil.which, ('chromium', 'chromium-browser', 'google-chrome'))), None)
+    if found is None:
+        pytest.skip('no chromium on this machine: apt-get install chromium')
+
+    def run(*arguments, profile):
+        return subprocess.run(
+            [found, '--headless', '--no-sandbox', '--disable-gpu', '--disable-background-networking',
+             '--disable-dev-shm-usage', '--hide-scrollbars', '--no-first-run', f'--user-data-dir={profile}',
+             '--virtual-time-budget=3000', *arguments], capture_output=True, text=True, timeout=90, check=True).stdout
+    return run
+
+
+def test_a_browser_shows_the_report_and_turns_the_hands(result, tmp_path, chromium):
+    path = write_report([result], tmp_path / 'out', depth_images(result))
+    # What a user does, and what then is on the screen, told by the title.
+    probe = """<script>
+      const canvas = document.querySelector('canvas'), before = canvas.toDataURL(), images = [...document.images];
+      canvas.dispatchEvent(new PointerEvent('pointermove', {movementX: 60, movementY: 10, buttons: 1}));
+      const turned = canvas.toDataURL();
+      canvas.dispatchEvent(new MouseEvent('dblclick'));
+      document.title = JSON.stringify({turned: turned !== before, back: canvas.toDataURL() === before,
+        loaded: images.every(image => image.complete && image.naturalWidth > 100), images: images.length,
+        wide: document.documentElement.scrollWidth > window.innerWidth});
+    </script></body>"""
+    probed = tmp_path / 'probed.html'
+    probed.write_text(path.read_text().replace('</body>', probe))
+    dom = chromium('--dump-dom', '--window-size=1200,3000', f'file://{probed}', profile=tmp_path / 'a')
+    assert json.loads(re.search(r'<title>(.*?)</title>', dom)[1]) == {
+        'turned': True, 'back': True, 'loaded': True, 'images': 7, 'wide': False}
+
+    chromium(f'--screenshot={tmp_path / "page.png"}', '--window-size=1200,4200', f'file://{path}',
+             profile=tmp_path / 'b')
+    page = cv2.imread(str(tmp_path / 'page.png'))
+    for bgr in ([178, 114, 0], [80, 92, 255], [24, 29, 20]):  # the curve, the thumb, the ground of a 3D view
+        assert (np.abs(page.astype(int) - bgr).max(-1) < 12).sum() > 200, f'no {bgr} on the page'
+
+
+def test_compare_prints_tables_and_intervals(result, tmp_path, capsys):
+    better = Result('better', HAND21, CAMERA, (result.predictions + result.truth) / 2, result.truth)
+    result.save(tmp_path / 'a.npz')
+    better.save(tmp_path / 'b.npz')
+    assert main(['compare', f'first={tmp_path / "a.npz"}', str(tmp_path / 'b.npz'), '--json', str(tmp_path / 'c.json'),
+                 '--out', str(tmp_path / 'plots'), '--block', '1']) == 0
+    printed = capsys.readouterr().out
+    assert 'better - first: -' in printed and '95 % interval' in printed
+    got = json.loads((tmp_path / 'c.json').read_text())
+    half = got['results'][0]['mean_mm'] / 2
+    assert got['differences'][0]['mean_mm'] == pytest.approx(-half, rel=1e-6)
+    low, high = got['differences'][0]['interval_mm']
+    assert low < -half < high < 0, 'certainly better'
+    assert (tmp_path / 'plots' / 'curves.svg').is_file()
+
+
+def test_compare_refuses_what_cannot_be_compared(result, tmp_path, capsys):
+    result.save(tmp_path / 'a.npz')
+    Result('short', HAND21, CAMERA, result.predictions[:9], result.truth[:9]).save(tmp_path / 'short.npz')
+    Result('blind', HAND21, CAMERA, result.predictions).save(tmp_path / 'blind.npz')
+    a, short, blind = (str(tmp_path / f'{name}.npz') for name in ('a', 'short', 'blind'))
+    assert main(['compare', a, short]) == 0
+    assert 'have 40 and 9 frames: no interval' in capsys.readouterr().err
+    assert main(['compare', a, blind]) == 1
+    assert 'blind has no ground truth' in capsys.readouterr().err
+    assert main(['compare', a, str(tmp_path / 'predictions.txt')]) == 1
+    assert 'need --ground-truth and --dataset' in capsys.readouterr().err
+    with pytest.raises(SystemExit) as caught:
+        main(['compare', a])
+    assert caught.value.code == 2

@@ -20,7 +20,7 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser('estimator', help='the ROS 2 node', formatter_class=argparse.RawTextHelpFormatter,
                                    description='Run the ROS 2 node until Ctrl-C.', epilog=EXAMPLES)
     parser.add_argument('--ros-args', nargs=argparse.REMAINDER, default=[], metavar='...',
-                        help='remappings (-r from:=to), parameters (-p name:=value, --params-file FILE), as with ros2 run')
+                        help='remappings (-r from:=to) and parameters (-p name:=value), as for ros2 run')
     parser.add_argument('--parameters', action='store_true', help='print the table of parameters and leave')
 
 

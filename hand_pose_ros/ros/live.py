@@ -50,12 +50,14 @@ class Answers:
 
 
 def play_through_node(bag: DepthBag, camera_info_topic: str | None = None,
-                      parameters: Mapping[str, Any] | None = None) -> Answers:
+                      parameters: Mapping[str, Any] | None = None, patient: bool = False) -> Answers:
     """Start the node `estimator` in a namespace of its own, play the depth images at their pace, and stop the node.
 
     Args:
         camera_info_topic: if it is not beside the depth topic.
         parameters: of the node.
+        patient: wait for each answer before the next image, so that a machine that is too slow, or busy with something
+            else, plays slower; otherwise the node drops images, as it would those of a camera.
 
     Raises:
         HandPoseError: the node does not come up, or dies.
@@ -79,10 +81,11 @@ def play_through_node(bag: DepthBag, camera_info_topic: str | None = None,
             replay = Replay(bag, topics={bag.depth_topic, *infos}, reliability='reliable')
             try:
                 replay.wait_for_subscribers(START_TIMEOUT_S)
-                replay.play()
+                answered = lambda: len(listener.answers) >= replay.published[bag.depth_topic]  # noqa: E731
+                replay.play(ready=answered if patient else None)
+                listener.wait_until_quiet()  # the last image goes with its publisher, if it is still on the way
             finally:
                 replay.close()
-            listener.wait_until_quiet()
             if process.poll() is not None:
                 raise HandPoseError(f'the node died with exit code {process.returncode}: its last words are above')
         answers, seen = listener.answers, listener.seen

@@ -289,6 +289,7 @@ def main(args: list[str] | None = None) -> int:
         HandPoseError: a parameter at start has a wrong type or value.
     """
     rclpy.init(args=args)
+    node = None
     try:
         node = EstimatorNode()
         executor = SingleThreadedExecutor()
@@ -299,5 +300,7 @@ def main(args: list[str] | None = None) -> int:
     except ParameterException as error:
         raise HandPoseError(f'{error}: check the command line and the parameter file') from error
     finally:
+        if node is not None:
+            node.destroy_node()
         rclpy.try_shutdown()
     return 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import time
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import Any
 
 import rclpy
@@ -24,6 +24,7 @@ from hand_pose_ros.errors import InputError
 
 CLOCK_PERIOD_S = 0.025
 SETTLE_S = 0.5
+PATIENCE_S = 3.0
 _RENAMED = {'tf/msg/tfMessage': 'tf2_msgs/msg/TFMessage'}  # on the way from ROS 1 to ROS 2
 
 
@@ -82,8 +83,11 @@ class Replay:
                 return
             self._executor.spin_once(timeout_sec=0.05)
 
-    def play(self, start_s: float = 0.0) -> None:
+    def play(self, start_s: float = 0.0, ready: Callable[[], bool] | None = None) -> None:
         """Publish the bag once, from `start_s` seconds after its beginning.
+
+        Args:
+            ready: a message that is due waits until this is true; after PATIENCE_S in vain it is not asked again.
 
         Raises:
             InputError: where the bag is damaged, after everything before the damage; or nothing was recorded so late.
@@ -95,12 +99,15 @@ class Replay:
             if first_ns < 0:
                 first_ns, self._origin = recorded_ns, time.monotonic()
             self._wait_for(recorded_ns, first_ns)
+            if ready is not None and not self._hold(ready):
+                ready = None
             self._outputs[connection.topic].publish(message)
             self.published[connection.topic] += 1
         if first_ns < 0:
             raise InputError(f'{self._bag.path}: nothing was recorded later than {start_s} s: give a smaller start')
         for output in self._outputs.values():
             output.wait_for_all_acked(Duration(seconds=1))
+        time.sleep(SETTLE_S)  # best effort is not acknowledged, and what is still on the way goes with its publisher
 
     def close(self) -> None:
         """Take the node and its topics off the graph."""
@@ -155,6 +162,14 @@ class Replay:
             if left <= 0:
                 self.lateness_s = max(self.lateness_s, -left)
                 return
+
+    def _hold(self, ready: Callable[[], bool]) -> bool:
+        """Let the time of the bag stand still until the listener is ready; False if it is not in the end."""
+        stopped = time.monotonic()
+        while not (done := ready()) and time.monotonic() - stopped < PATIENCE_S:
+            self._executor.spin_once(timeout_sec=0.002)
+        self._origin += time.monotonic() - stopped
+        return done
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._paused = request.data

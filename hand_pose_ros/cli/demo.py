@@ -1,0 +1,127 @@
+"""`hand-pose demo`: a recorded bag through the live node, over real DDS, and what came out, to look at."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+
+from hand_pose_ros.bags import DepthBag, RecordedHands, read_hands
+from hand_pose_ros.drawing import Picture, contact_sheet, overlay
+from hand_pose_ros.errors import InputError
+from hand_pose_ros.resources import resource
+from hand_pose_ros.skeleton import get_skeleton
+
+if TYPE_CHECKING:
+    from hand_pose_ros.estimator import HandEstimate
+    from hand_pose_ros.ros.live import Answers
+
+TRUTH_TOPIC = '/truth/joints'
+SHEET_PICTURES = 12
+ANIMATION_HEIGHT = 320
+
+EXAMPLES = """examples:
+  hand-pose demo
+  hand-pose demo --out /tmp/demo
+  hand-pose demo --bag recording.mcap --model my_weights.safetensors
+
+It leaves sheet.png, animation.webp (any browser shows it) and summary.json in the folder. The exit code is 0 if every
+image was answered.
+"""
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add this verb to the command line."""
+    parser = subparsers.add_parser(
+        'demo', help='play the recorded bag that ships through the live node and show what comes out',
+        description='Play a bag through the real node in another process, and show what comes out.', epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--out', type=Path, default=Path('demo_output'), metavar='FOLDER', help='(demo_output)')
+    parser.add_argument('--bag', type=Path, help='another bag than the one that ships; its truth, if it has any, is '
+                        f'a HandJointsArray on {TRUTH_TOPIC}')
+    parser.add_argument('--model', default='', help='name of weights that ship, or a checkpoint (the default weights)')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Play, draw, and sum up; 1 if an image was left without an answer."""
+    from hand_pose_ros.ros.conversions import hand_from_msg
+    from hand_pose_ros.ros.live import play_through_node
+
+    path = args.bag or resource('demo/hand.mcap')
+    parameters = {'model': args.model} if args.model else {}
+    with DepthBag(path) as bag:
+        print(f'playing {len(bag)} depth images of {path} through the node ...', flush=True)
+        answers = play_through_node(bag, parameters=parameters, patient=True)
+        skeleton = get_skeleton(answers.skeleton)
+        hands = {stamp: [hand_from_msg(hand, skeleton) for hand in answer.hands]
+                 for stamp, answer in answers.hands.items()}
+        frames = list(bag)
+    pictures = [overlay(frame.depth, frame.intrinsics, hands.get(frame.stamp_ns, []), skeleton, ANIMATION_HEIGHT)
+                for frame in frames]
+    summary = summarise([frame.stamp_ns for frame in frames], answers, hands, _truth(path))
+    args.out.mkdir(parents=True, exist_ok=True)
+    chosen = np.linspace(0, len(pictures) - 1, min(SHEET_PICTURES, len(pictures))).round().astype(int)
+    _write(args.out / 'sheet.png', cv2.imencode('.png', contact_sheet([pictures[i] for i in chosen], 3))[1].tobytes())
+    _animate(args.out / 'animation.webp', pictures, [frame.stamp_ns for frame in frames])
+    _write(args.out / 'summary.json', json.dumps(summary, indent=2).encode() + b'\n')
+    for name, value in summary.items():
+        print(f'  {name.replace("_", " "):<22}{value if isinstance(value, int) or value is None else f"{value:.1f}"}')
+    print(f'see {args.out / "sheet.png"} and {args.out / "animation.webp"}')
+    return 0 if summary['frames_answered'] == summary['frames_in'] else 1
+
+
+def summarise(stamps: Sequence[int], answers: Answers, hands: dict[int, list[HandEstimate]],
+              truth: dict[int, RecordedHands]) -> dict[str, float | int | None]:
+    """What the table shows; times in ms, errors in mm, None for what cannot be known.
+
+    Args:
+        stamps: of the images that were played, ns.
+        hands: stamp -> what the node answered.
+        truth: stamp -> what is really there. The first hand of each is compared.
+    """
+    latency_ms = np.array([answers.latency_s[stamp] for stamp in stamps if stamp in answers.latency_s]) * 1e3
+    errors_mm = [np.linalg.norm(hands[stamp][0].joints - truth[stamp].joints[0], axis=1) * 1e3
+                 for stamp in stamps if hands.get(stamp) and stamp in truth and len(truth[stamp].joints)]
+    return {
+        'frames_in': len(stamps),
+        'frames_answered': sum(stamp in answers.hands for stamp in stamps),
+        'frames_with_a_hand': sum(bool(hands.get(stamp)) for stamp in stamps),
+        'latency_p50_ms': float(np.percentile(latency_ms, 50)) if len(latency_ms) else None,
+        'latency_p99_ms': float(np.percentile(latency_ms, 99)) if len(latency_ms) else None,
+        'joint_error_mean_mm': float(np.mean(errors_mm)) if errors_mm else None,
+        'joint_error_median_mm': float(np.median(errors_mm)) if errors_mm else None,
+    }
+
+
+def _truth(path: Path) -> dict[int, RecordedHands]:
+    try:
+        return {hands.stamp_ns: hands for hands in read_hands(path, TRUTH_TOPIC)}
+    except InputError:
+        return {}  # a bag of a real camera
+
+
+def _animate(path: Path, pictures: Sequence[Picture], stamps: Sequence[int]) -> None:
+    """All pictures at the pace of the recording."""
+    from PIL import Image  # comes with matplotlib
+
+    width = max(picture.shape[1] for picture in pictures)
+    images = [Image.fromarray(cv2.copyMakeBorder(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), 0, 0, 0,
+                                                 width - picture.shape[1], cv2.BORDER_CONSTANT))
+              for picture in pictures]
+    period_ms = round((stamps[-1] - stamps[0]) / max(len(stamps) - 1, 1) / 1e6)
+    part = path.with_name(f'.{path.name}')
+    images[0].save(part, format='WEBP', save_all=True, append_images=images[1:], duration=max(period_ms, 10), loop=0,
+                   quality=60, method=0)
+    os.replace(part, path)
+
+
+def _write(path: Path, data: bytes) -> None:
+    part = path.with_name(f'.{path.name}')
+    part.write_bytes(data)
+    os.replace(part, path)

@@ -13,7 +13,7 @@ EPILOG = """examples:
   hand-pose train paper --out runs/orref --set refiner=or_ref --set base=runs/deep-prior/best.safetensors
   hand-pose train paper --out runs/nyu --set dataset=nyu --set root=/data/NYU
   hand-pose train --out runs/modern --resume
-  torchrun --nproc-per-node 4 -m hand_pose_ros.cli train modern --out runs/modern --device cuda --workers 0
+  torchrun --nproc-per-node 4 --no-python hand-pose train modern --out runs/modern --device cuda --workers 0
 
 recipes: paper, original-code, modern; docs/training.md says what they do and lists every value.
 """
@@ -29,7 +29,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('--resume', action='store_true', help='continue the run in RUN')
     parser.add_argument('--device', default='cpu', help='cpu or cuda (default: %(default)s)')
     parser.add_argument('--workers', type=int, default=1,
-                        help='processes that render or decode samples; 0: on the device itself, for a GPU (default: %(default)s)')
+                        help='processes that render or decode; 0: on the device, for a GPU (default: %(default)s)')
     parser.add_argument('--threads', type=int, help='threads of the training process (default: all cores)')
     parser.add_argument('--cache', type=Path, default=Path('~/.cache/hand_pose_ros/samples').expanduser(),
                         help='where rendered and decoded samples are kept for all runs (default: %(default)s)')
@@ -44,7 +44,8 @@ def run(args: argparse.Namespace) -> int:
     from tqdm.contrib.logging import logging_redirect_tqdm
 
     from hand_pose_ros.training.distributed import process_group
-    from hand_pose_ros.training.loop import Machine, Run, resume_recipe
+    from hand_pose_ros.training.folder import RunFolder
+    from hand_pose_ros.training.loop import Machine, Run
     from hand_pose_ros.training.recipes import get_recipe
 
     if args.resume and (args.recipe or args.overrides):
@@ -52,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     if not args.resume and not args.recipe:
         args.parser.error('give a RECIPE (paper, original-code or modern), or --resume')
     logging.basicConfig(level=logging.INFO, format='%(message)s')
-    recipe = resume_recipe(args.out) if args.resume else get_recipe(args.recipe, args.overrides)
+    recipe = RunFolder(args.out).recipe() if args.resume else get_recipe(args.recipe, args.overrides)
     machine = Machine(args.cache, args.device, args.workers, args.threads, args.cache_gb)
     with logging_redirect_tqdm(), process_group(args.device):
         Run(args.out, recipe, machine).train(args.resume)

@@ -14,15 +14,17 @@ SUFFIXES = ('.bag', '.mcap', '.db3')
 
 
 class Bags(RecordedDataset):
-    """`root`/{train,val,test}/ with bags in each, so that no recording is in two splits. Every hand of every HandJointsArray
-    is a sample; its depth image is the one with the same stamp.
+    """`root`/{train,val,test}/ with bags in each, so that no recording is in two splits.
+
+    Every hand of every HandJointsArray is a sample; its depth image is the one with the same stamp.
     """
 
     skeleton: Skeleton
 
     def __init__(self, root: Path, split: str) -> None:
         self.name = f'bags-{split}'
-        bags = sorted(path for path in (root / split).glob('*') if path.suffix in SUFFIXES or (path / 'metadata.yaml').exists())
+        bags = sorted(path for path in (root / split).glob('*')
+                      if path.suffix in SUFFIXES or (path / 'metadata.yaml').exists())
         if not bags:
             raise DatasetError(f'bags: {root / split} holds no bags (.mcap, .bag, .db3, or folders with metadata.yaml)')
         self._samples: list[tuple[Path, RecordedHands, int]] = []
@@ -31,7 +33,8 @@ class Bags(RecordedDataset):
                 self._samples += [(bag, hands, i) for i in range(len(hands.joints))]
         names = {hands.skeleton for _, hands, _ in self._samples}
         if len(names) != 1:
-            raise DatasetError(f'bags: {root / split} must hold hands of one skeleton, not of {sorted(names) or "none"}')
+            raise DatasetError(f'bags: {root / split} must hold hands of one skeleton, '
+                               f'not of {", ".join(sorted(names)) or "none"}')
         self.skeleton = get_skeleton(names.pop())
         self.size = len(self._samples)
         self._reading: tuple[Path, Iterator[Frame], Frame] | None = None
@@ -56,5 +59,5 @@ class Bags(RecordedDataset):
                 break
             self._reading = bag, frames, frame
         if frame.stamp_ns != stamp_ns:
-            raise DatasetError(f'bags: {bag} has hands with the stamp {stamp_ns} ns, but no depth image with that stamp')
+            raise DatasetError(f'bags: {bag} has hands with the stamp {stamp_ns} ns, but no depth image with it')
         return frame

@@ -53,7 +53,8 @@ class MSRA(RecordedDataset):
             for gesture in gestures:
                 self._frames += [(subject, *frame) for frame in _read_gesture(gesture)]
         self.size = len(self._frames)
-        self.fingerprint = fingerprint(self.name, *(f'{path}{joints.tolist()}'.encode() for _, path, joints in self._frames))
+        self.fingerprint = fingerprint(
+            self.name, *(f'{path}{joints.tolist()}'.encode() for _, path, joints in self._frames))
 
     def frame(self, index: int) -> LabelledFrame:
         subject, path, joints = self._frames[index]
@@ -74,7 +75,8 @@ def read_bin(path: Path) -> np.ndarray:
         if (0 <= left <= right <= width <= 4096 and 0 <= top <= bottom <= height <= 4096
                 and len(data) == 24 + 4 * (bottom - top) * (right - left)):
             depth = np.zeros((height, width), np.float32)
-            depth[top:bottom, left:right] = np.frombuffer(data, '<f4', offset=24).reshape(bottom - top, right - left) / 1000
+            part = np.frombuffer(data, '<f4', offset=24).reshape(bottom - top, right - left)
+            depth[top:bottom, left:right] = part / 1000
             return depth
     raise DatasetError(f'MSRA: {path} is damaged ({len(data)} bytes); copy or download it again')
 

@@ -40,7 +40,7 @@ class NYU(RecordedDataset):
             joints = np.asarray(loadmat(labels, variable_names=['joint_xyz'])['joint_xyz'][0])  # of camera 1
             joints = joints[:, JOINTS]
         except Exception as error:  # scipy raises what it likes on a damaged file
-            raise DatasetError(f'NYU: {labels} is damaged or holds no joint_xyz ({error}); download it again') from error
+            raise DatasetError(f'NYU: {labels} is damaged or has no joint_xyz ({error}); download it again') from error
         self._joints = joints * (0.001, -0.001, 0.001)  # mm with y up -> m with y down
         count = len(joints)
         held_out = max(1, round(count * HELD_OUT))
@@ -57,7 +57,7 @@ class NYU(RecordedDataset):
         return self._folder / f'depth_1_{frame + 1:07d}.png'
 
     def frame(self, index: int) -> LabelledFrame:
-        """Depth is packed in two channels: green holds the high byte, blue the low one; 2001 and above is no reading."""
+        """Depth is packed in two channels, green for the high byte, blue for the low; 2001 and above is no reading."""
         frame = self._frames[index]
         image = read_depth(self._path(frame), 'NYU', channels=3).astype(np.uint16)
         millimetres = image[..., 1] << 8 | image[..., 0]

@@ -1,8 +1,8 @@
 """One sample seen many ways: turned, moved and scaled in the plane of the patch, with noise and gaps.
 
-The geometry is exact. Cube units follow the rays of the camera, so another cube around the same scene is an affine map
-of patch and joints, and a turn of the patch about its centre is a roll of the camera if the centre of the cube is turned
-along. What the new cube sees beyond the old one is unknown and becomes background.
+The geometry is exact. Cube units follow the rays of the camera, so another cube around the same scene is an affine
+map of patch and joints, and a turn of the patch about its centre is a roll of the camera, if the centre of the cube is
+turned along. What the new cube sees beyond the old one is unknown and becomes background.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ PRESETS = {
     'none': Augmentation(),  # the paper mentions none
     'deep_prior_pp': Augmentation(rotation_deg=180, jitter=0.005, exclusive=True),  # original code
     'modern': Augmentation(rotation_deg=180, jitter=0.008, jitter_tail=0.1, scale=1.2, noise=0.002, dropout=0.15,
-                           erase=0.3),
+                           erase=0.3, mirror=0.15),
 }
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -30,6 +32,10 @@ class PoseObjective(nn.Module):
         return self.network(patch)
 
 
+_WEIGHTS = {'maps': 1.0, 'confidence': 0.01, 'hand': 0.01, 'side': 0.01, 'size': 0.01}
+"""Of the terms of a dense network; the joints have 1. The small ones are not to bend the features."""
+
+
 class DenseObjective(PoseObjective):
     """A network with maps of votes for the joints, and with what a tracker needs to know beside them.
 
@@ -40,8 +46,6 @@ class DenseObjective(PoseObjective):
       sees the hand in its cube and nothing else
     """
 
-    WEIGHTS = {'maps': 1.0, 'confidence': 0.01, 'hand': 0.01, 'side': 0.01, 'size': 0.01}
-    """The joints have 1; the others are there to be right, not to bend the features."""
     CONFIDENT = 0.020
     """Metres."""
 
@@ -55,8 +59,8 @@ class DenseObjective(PoseObjective):
         joints = out['joints'].float()
         directions, closeness = encode(out['positions'], truth)
         seen = out['seen']  # (B, 1, 32, 32)
-        maps = (F.smooth_l1_loss(out['closeness'], closeness, reduction='none', beta=self.recipe.knee)
-                + F.smooth_l1_loss(out['directions'], directions, reduction='none', beta=self.recipe.knee).mean(2)) * seen
+        apart = partial(F.smooth_l1_loss, reduction='none', beta=self.recipe.knee)
+        maps = (apart(out['closeness'], closeness) + apart(out['directions'], directions).mean(2)) * seen
         maps = maps.mean(1).sum((1, 2)) / seen.sum((1, 2, 3)).clamp(min=1)
 
         with torch.no_grad():
@@ -72,15 +76,15 @@ class DenseObjective(PoseObjective):
             'size': F.smooth_l1_loss(out['size'].float(), size, reduction='none', beta=0.1) * counts,
         }
         return {'joints': joint_loss(self.recipe.loss, self.recipe.knee, joints, truth, counts),
-                **{name: self.WEIGHTS[name] * value.mean() for name, value in extra.items()}}
+                **{name: _WEIGHTS[name] * value.mean() for name, value in extra.items()}}
 
 
 class RefinerObjective(nn.Module):
     """A refiner over a first stage that stays as it is.
 
-    It must learn from errors as the first stage makes them on *new* data, so its samples are ones that the first stage
-    was not trained on. Jitter on top of the estimates shows it the errors between those that happen to occur; the second
-    iteration starts where the first one left off, as in use.
+    It must learn from errors as the first stage makes them on *new* data, so its samples are ones that the first
+    stage was not trained on. Jitter on top of the estimates shows it the errors between those that happen to occur;
+    the second iteration starts where the first one left off, as in use.
     """
 
     ITERATIONS = 2

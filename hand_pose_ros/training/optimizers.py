@@ -15,7 +15,7 @@ from hand_pose_ros.training.recipes import Recipe
 
 
 class FlooredRMSProp(Optimizer):
-    """RMSProp as in the original code: decay 0.9, and the root mean square floored at 0.01 instead of a small addition."""
+    """RMSProp of the original code: decay 0.9, and the root mean square floored at 0.01, with nothing added."""
 
     def __init__(self, params: Any, lr: float) -> None:
         super().__init__(params, {'lr': lr})
@@ -55,8 +55,8 @@ def make_optimizer(recipe: Recipe, network: nn.Module) -> Optimizer:
 def learning_rate(recipe: Recipe, progress: float) -> float:
     """The learning rate after this share of the budget, in [0, 1].
 
-    'constant'; 'hyperbolic', in steps by epoch, rate / (1 + 0.2 epoch) with the first epoch 1 (original code); 'cosine',
-    down to 0.
+    'constant'; 'hyperbolic', in steps by epoch, rate / (1 + 0.2 epoch) with the first epoch 1 (original code);
+    'cosine', down to 0.
 
     Raises:
         HandPoseError: unknown schedule.

@@ -60,7 +60,7 @@ class Recipe:
     """'float32', or 'bfloat16' for the convolutions and matrix products of the forward and backward pass: two to four
     times as fast, on a GPU and on a CPU that has the instructions (avx512_bf16, amx)."""
     average: float = 0.0
-    """Decay per step of the running average of the weights that is validated and shipped; 0 = the weights themselves."""
+    """Decay per step of the average of the weights that is validated and shipped; 0 = the weights themselves."""
     seed: int = 23455
 
     # Validation
@@ -133,7 +133,7 @@ def _replace(target: T, keys: list[str], text: str, item: str) -> T:
             raise HandPoseError(f"--set {item}: '{key}' is one value")
     elif fields[key] == 'Augmentation':
         if text not in PRESETS:
-            raise HandPoseError(f"--set {item}: choose one of {', '.join(PRESETS)}, or set one value: {key}.jitter=0.01")
+            raise HandPoseError(f"--set {item}: choose one of {', '.join(PRESETS)}, or one value: {key}.jitter=0.01")
         value = PRESETS[text]
     else:
         value = _convert(text, fields[key], item)
@@ -151,7 +151,7 @@ def _literal(text: str) -> Any:
 
 def _convert(text: str, kind: str, item: str) -> Any:
     """The value of a text for a field of this annotated type."""
-    value, kinds = _literal(text), kind.split(' | ')
+    value, kinds = _literal(text), [part.split('[')[0] for part in kind.split(' | ')]
     if value is None and 'None' in kinds:
         return None
     if 'str' in kinds:

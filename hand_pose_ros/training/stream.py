@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hand_pose_ros.datasets import Batch
+from hand_pose_ros.datasets import Batch, DatasetError
 from hand_pose_ros.datasets.shards import DiskShards, MemoryShards
 
 
@@ -32,15 +32,15 @@ class SampleStream:
         self.first, self.part = first, part
         size, n = shards.dataset.size, shards.shard_size
         self._window: range | None = None
-        self._end = -1
+        self.epoch_size: int | None = None
+        """Samples in a pass over a finite dataset."""
         if size is not None:
             self._window = range(first, min(-(-size // n), last if last is not None else size))
-            self._end = min(self._window.stop * n, size) - first * n
+            self.epoch_size = min(self._window.stop * n, size) - first * n
+            if self.epoch_size <= 0:
+                raise DatasetError(f'{shards.dataset.name} has {-(-size // n)} shards of {n} samples: none is left '
+                                   f'from first_shard={first} to last_shard={last}')
         self._stage: tuple[int, NDArray[np.int64]] | None = None
-
-    def epoch_size(self) -> int | None:
-        """Samples in a pass over a finite dataset."""
-        return self._end if self._window is not None else None
 
     def batch(self, step: int) -> tuple[Batch, torch.Tensor]:
         """The samples of a step (patches as float32), and their numbers (B,) in the order of consumption."""
@@ -52,7 +52,7 @@ class SampleStream:
         while len(numbers):
             stage, offset, size = self._locate(int(numbers[0]))
             here = numbers[:size - offset]
-            parts += self._read(stage, offset, len(here))
+            parts += self._read(stage, offset, len(here), size)
             numbers = numbers[len(here):]
         batch = {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
         batch['patch'] = batch['patch'].float()
@@ -72,8 +72,8 @@ class SampleStream:
 
     def _locate(self, number: int) -> tuple[int, int, int]:
         """The stage of a sample, its place in it, and the size of the stage."""
-        if self._window is not None:
-            return number // self._end, number % self._end, self._end
+        if self.epoch_size is not None:
+            return number // self.epoch_size, number % self.epoch_size, self.epoch_size
         n, k = self.shards.shard_size, self.reuse
         rising = n * k * (k - 1) // 2  # the first k - 1 stages show 1, 2, ... k - 1 shards
         if number >= rising:
@@ -81,10 +81,9 @@ class SampleStream:
         stage = next(s for s in range(k) if number < n * (s + 1) * (s + 2) // 2)
         return stage, number - n * stage * (stage + 1) // 2, n * (stage + 1)
 
-    def _read(self, stage: int, offset: int, count: int) -> Iterator[Batch]:
+    def _read(self, stage: int, offset: int, count: int, size: int) -> Iterator[Batch]:
         n, window = self.shards.shard_size, self.window(stage)
         if self._stage is None or self._stage[0] != stage:
-            size = self._locate_size(window)
             self._stage = stage, np.random.default_rng((self.seed, stage)).permutation(size)
             ahead = range(window.stop, window.stop + DiskShards.AHEAD) if self._window is None else ()
             self.shards.keep([*window, *ahead])
@@ -93,6 +92,3 @@ class SampleStream:
             tensors = self.shards.read(window[int(shard)])
             rows = torch.from_numpy(np.sort(order[order // n == shard] % n))
             yield {key: value[rows.to(value.device)] for key, value in tensors.items()}
-
-    def _locate_size(self, window: range) -> int:
-        return self._end if self._window is not None else len(window) * self.shards.shard_size

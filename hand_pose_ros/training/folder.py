@@ -1,0 +1,100 @@
+"""The folder of a run: what was trained, how it went, and what came out."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import subprocess
+from pathlib import Path
+from typing import Any
+
+from hand_pose_ros.errors import HandPoseError
+from hand_pose_ros.training.recipes import Recipe, recipe_from_dict, recipe_to_dict
+
+log = logging.getLogger(__name__)
+
+
+class TrainingError(HandPoseError):
+    """Training that cannot start or go on."""
+
+
+class RunFolder:
+    """Files of one run.
+
+    config.json (recipe, git revision) · state.safetensors (to resume) · last.safetensors and best.safetensors
+    (checkpoints to use) · metrics.jsonl · log.txt · TensorBoard events, if it is installed.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.state = path / 'state.safetensors'
+        self._tensorboard: Any = None
+        self._log: logging.Handler | None = None
+
+    def checkpoint(self, name: str) -> Path:
+        """'best' or 'last'."""
+        return self.path / f'{name}.safetensors'
+
+    def recipe(self) -> Recipe:
+        """What the run was started with.
+
+        Raises:
+            TrainingError: there is no run here.
+        """
+        try:
+            return recipe_from_dict(json.loads((self.path / 'config.json').read_text())['recipe'])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise TrainingError(f'{self.path} holds no run to resume ({error})') from error
+
+    def create(self, recipe: Recipe) -> None:
+        """Start a new run here.
+
+        Raises:
+            TrainingError: the folder holds a run already.
+        """
+        if self.state.exists():
+            raise TrainingError(f'{self.path} holds a run already: continue it with --resume, or choose another --out')
+        self.path.mkdir(parents=True, exist_ok=True)
+        write_json(self.path / 'config.json', {'recipe': recipe_to_dict(recipe), 'git': _git_revision()})
+
+    def open(self) -> None:
+        """Begin to write."""
+        self._log = logging.FileHandler(self.path / 'log.txt')
+        self._log.setFormatter(logging.Formatter('%(asctime)s %(message)s'))
+        logging.getLogger('hand_pose_ros').addHandler(self._log)
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+            self._tensorboard = SummaryWriter(str(self.path))
+        except ImportError:
+            log.info('no events for TensorBoard: it is not installed')
+
+    def write(self, values: dict[str, Any]) -> None:
+        """A line of metrics.jsonl, with the count of 'samples' in it."""
+        with open(self.path / 'metrics.jsonl', 'a', encoding='utf-8') as file:
+            file.write(json.dumps(values) + '\n')
+        if self._tensorboard is not None:
+            for name, value in values.items():
+                self._tensorboard.add_scalar(name, value, values['samples'])
+
+    def close(self) -> None:
+        if self._tensorboard is not None:
+            self._tensorboard.close()
+        if self._log is not None:
+            logging.getLogger('hand_pose_ros').removeHandler(self._log)
+            self._log.close()
+
+
+def write_json(path: Path, values: Any) -> None:
+    """In one step, so that no reader sees half of it."""
+    temporary = path.with_name(f'.{path.name}.{os.getpid()}.tmp')
+    temporary.write_text(json.dumps(values, indent=2) + '\n', encoding='utf-8')
+    os.replace(temporary, path)
+
+
+def _git_revision() -> str | None:
+    try:
+        return subprocess.run(['git', 'describe', '--always', '--dirty', '--abbrev=12'], cwd=Path(__file__).parent,
+                              capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return None

@@ -1,0 +1,294 @@
+"""Datasets are read in the formats they are distributed in, and samples are kept on disk without surprises."""
+
+import gzip
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from scipy.io import savemat
+
+from hand_pose_ros.bags.writer import BagWriter
+from hand_pose_ros.datasets import DatasetError, joints_in_metres, open_dataset
+from hand_pose_ros.datasets import icvl as icvl_module
+from hand_pose_ros.datasets import nyu as nyu_module
+from hand_pose_ros.datasets.base import center_of_mass_cube
+from hand_pose_ros.datasets.shards import DiskShards, MemoryShards
+from hand_pose_ros.geometry import Cube, Intrinsics
+from hand_pose_ros.skeleton import HAND21
+
+SPLITS = ('train', 'val', 'test', 'test_1', 'test_2')
+
+
+def blob(intrinsics: Intrinsics, center: np.ndarray, radius: float = 0.06) -> np.ndarray:
+    """A ball (its front, roughly) in front of nothing; depth in metres."""
+    v, u = np.mgrid[:intrinsics.height, :intrinsics.width]
+    cu, cv = intrinsics.project(center)
+    reach = radius * intrinsics.fx / center[2]
+    away = ((u - cu) ** 2 + (v - cv) ** 2) / reach ** 2
+    return np.where(away < 1, center[2] - radius * np.sqrt(np.clip(1 - away, 0, None)), 0).astype(np.float32)
+
+
+def scattered(rng: np.random.Generator, joints: int, center: np.ndarray) -> np.ndarray:
+    return center + rng.uniform(-0.04, 0.04, (joints, 3))
+
+
+# NYU
+
+def write_nyu(root: Path, part: str, frames: int, rng: np.random.Generator) -> np.ndarray:
+    """Joints (N, 36, 3) in metres, optical frame."""
+    folder = root / part
+    folder.mkdir(parents=True)
+    joints = np.stack([scattered(rng, 36, np.array([0.05 * i, 0.02, 0.7])) for i in range(frames)])
+    in_file = joints * (1000, -1000, 1000)
+    savemat(folder / 'joint_data.mat', {'joint_xyz': np.stack([in_file, in_file + 7, in_file - 7]),
+                                        'joint_uvd': np.zeros((3, frames, 36, 3))})
+    for i in range(frames):
+        millimetres = (blob(nyu_module.INTRINSICS, joints[i].mean(0)) * 1000).round().astype(np.uint16)
+        millimetres[millimetres == 0] = 2001
+        write_nyu_png(folder / f'depth_1_{i + 1:07d}.png', millimetres)
+    return joints
+
+
+def write_nyu_png(path: Path, millimetres: np.ndarray) -> None:
+    image = np.zeros((*millimetres.shape, 3), np.uint8)
+    image[..., 0], image[..., 1] = millimetres & 255, millimetres >> 8  # OpenCV: blue, green, red
+    cv2.imwrite(str(path), image)
+
+
+def test_nyu(tmp_path, monkeypatch):
+    monkeypatch.setattr(nyu_module, 'FIRST_SUBJECT', 2)
+    rng = np.random.default_rng(1)
+    train, test = write_nyu(tmp_path, 'train', 6, rng), write_nyu(tmp_path, 'test', 3, rng)
+    sizes = {split: open_dataset('nyu', split, tmp_path).size for split in SPLITS}
+    assert sizes == {'train': 5, 'val': 1, 'test': 3, 'test_1': 2, 'test_2': 1}
+
+    dataset = open_dataset('nyu', 'test', tmp_path)
+    frame = dataset.frame(1)
+    np.testing.assert_allclose(frame.joints, test[1][list(nyu_module.JOINTS)], atol=1e-9)
+    surface = blob(nyu_module.INTRINSICS, test[1].mean(0))
+    np.testing.assert_allclose(frame.depth, surface, atol=0.0006)
+    assert (frame.depth[surface == 0] == 0).all()
+    assert [dataset.frame(i).cube_side for i in range(3)] == pytest.approx([0.3, 0.3, 0.249])
+    np.testing.assert_allclose(open_dataset('nyu', 'val', tmp_path).frame(0).joints, train[5][list(nyu_module.JOINTS)])
+
+    batch = dataset.batch(torch.tensor([2, 0]))
+    metres = joints_in_metres(batch['joints'], batch['cube_center'], batch['cube_side'])
+    np.testing.assert_allclose(metres, test[[2, 0]][:, list(nyu_module.JOINTS)], atol=1e-5)
+
+
+def test_nyu_real_frame_and_its_published_label(tmp_path, shared_data):
+    """The surface lies 3 to 33 mm in front of the labelled joints, where their label says."""
+    with gzip.open(shared_data / 'published' / 'nyu' / 'groundtruth.txt.gz', 'rt') as file:
+        uvd = np.array(file.readline().split(), float).reshape(14, 3)
+    fx, fy = nyu_module.INTRINSICS.fx, nyu_module.INTRINSICS.fy
+    xyz = np.zeros((3, 1, 36, 3))  # as in the dataset: mm, y up
+    xyz[0, 0, nyu_module.JOINTS] = np.stack([(uvd[:, 0] - 320) * uvd[:, 2] / fx, (240 - uvd[:, 1]) * uvd[:, 2] / fy,
+                                             uvd[:, 2]], axis=1)
+    (tmp_path / 'test').mkdir()
+    savemat(tmp_path / 'test' / 'joint_data.mat', {'joint_xyz': xyz})
+    name = 'depth_1_0000001.png'
+    (tmp_path / 'test' / name).symlink_to(shared_data / 'frames' / 'nyu' / name)
+
+    dataset = open_dataset('nyu', 'test', tmp_path)
+    frame = dataset.frame(0)
+    np.testing.assert_allclose(frame.intrinsics.project(frame.joints), uvd[:, :2], atol=1e-6)
+    batch = dataset.batch(torch.tensor([0]))
+    patch, joints = batch['patch'][0, 0].numpy(), batch['joints'][0].numpy()
+    columns, rows = ((joints[:, :2] + 1) * 64 - 0.5).round().astype(int).T
+    behind_surface = (joints[:, 2] - patch[rows, columns]) * 150
+    assert (behind_surface > 0).all() and (behind_surface < 40).all()
+
+
+# ICVL
+
+def write_icvl(root: Path, rng: np.random.Generator, labels: str = 'labels.txt') -> None:
+    def write(path: Path, names: list[str]) -> None:
+        lines = []
+        for name in names:
+            joints = scattered(rng, 16, np.array([0.0, 0.0, 0.4]))
+            uv = icvl_module.INTRINSICS.project(joints)
+            lines.append(' '.join([name, *(f'{u:.3f} {v:.3f} {z:.3f}' for (u, v), z in
+                                           zip(uv, joints[:, 2] * 1000, strict=True))]))
+            (root / 'Depth' / name).parent.mkdir(parents=True, exist_ok=True)
+            depth = blob(icvl_module.INTRINSICS, joints.mean(0)) * 1000
+            cv2.imwrite(str(root / 'Depth' / name), depth.round().astype(np.uint16))
+        path.write_text('\n\n'.join(lines) + '\n \n')
+    root.mkdir(parents=True, exist_ok=True)
+    write(root / labels, ['201403121135/image_0000.png', '201403121135/image_0001.png', '45/image_0000.png',
+                          '122-5/image_0000.png', '201405151126/image_0000.png'])
+    write(root / 'test_seq_1.txt', ['test_seq_1/image_0000.png', 'test_seq_1/image_0001.png'])
+    write(root / 'test_seq_2.txt', ['test_seq_2/image_0000.png'])
+
+
+@pytest.mark.parametrize('labels', ['labels.txt', 'train.txt'])
+def test_icvl(tmp_path, labels):
+    write_icvl(tmp_path, np.random.default_rng(2), labels)
+    sizes = {split: open_dataset('icvl', split, tmp_path).size for split in SPLITS}
+    assert sizes == {'train': 2, 'val': 1, 'test': 3, 'test_1': 2, 'test_2': 1}  # rotated copies are left out
+    frame = open_dataset('icvl', 'test', tmp_path).frame(2)
+    words = (tmp_path / 'test_seq_2.txt').read_text().split()
+    np.testing.assert_allclose(frame.intrinsics.project(frame.joints[3]), [float(w) for w in words[10:12]], atol=1e-6)
+    assert frame.depth.max() == pytest.approx(0.4, abs=0.02)
+
+
+def test_icvl_says_what_is_missing(tmp_path):
+    with pytest.raises(DatasetError, match=r'neither .* holds labels\.txt or train\.txt'):
+        open_dataset('icvl', 'train', tmp_path)
+    write_icvl(tmp_path, np.random.default_rng(2))
+    (tmp_path / 'Depth' / '201403121135' / 'image_0001.png').unlink()
+    with pytest.raises(DatasetError, match=r'Depth/201403121135/image_0001\.png is missing'):
+        open_dataset('icvl', 'train', tmp_path)
+    (tmp_path / 'Depth' / '201405151126' / 'image_0000.png').write_bytes(b'half a download')
+    with pytest.raises(DatasetError, match=r'image_0000\.png is damaged'):
+        open_dataset('icvl', 'val', tmp_path).frame(0)
+    (tmp_path / 'labels.txt').write_text('201403121135/image_0000.png 1 2 3')
+    with pytest.raises(DatasetError, match=r'line 1 of .*labels\.txt'):
+        open_dataset('icvl', 'train', tmp_path)
+
+
+# MSRA15
+
+def write_msra(root: Path, rng: np.random.Generator) -> np.ndarray:
+    """Every subject has one gesture with frames 0, 1 and 3 of 4; returns the joints of P2, optical frame."""
+    kept = None
+    for subject in range(9):
+        folder = root / f'P{subject}' / '1'
+        folder.mkdir(parents=True)
+        joints = np.stack([scattered(rng, 21, np.array([0.0, 0.0, 0.4])) for _ in range(4)])
+        kept = joints if subject == 2 else kept
+        lines = [' '.join(f'{value:.6f}' for value in frame.ravel()) for frame in joints * (1000, -1000, -1000)]
+        (folder / 'joint.txt').write_text('4\n' + '\n'.join(lines) + '\n')
+        for i in (0, 1, 3):
+            header = np.array([320, 240, 100, 80, 220, 160], '<i4')
+            part = (blob(icvl_module.INTRINSICS, joints[i].mean(0)) * 1000)[80:160, 100:220]
+            (folder / f'{i:06d}_depth.bin').write_bytes(header.tobytes() + part.astype('<f4').tobytes())
+    assert kept is not None
+    return kept
+
+
+def test_msra_leaves_one_subject_out_and_goes_by_file_name(tmp_path):
+    joints = write_msra(tmp_path, np.random.default_rng(3))
+    sizes = {split: open_dataset('msra:P2', split, tmp_path).size for split in ('train', 'val', 'test')}
+    assert sizes == {'train': 21, 'val': 3, 'test': 3}
+    test = open_dataset('msra:P2', 'test', tmp_path)
+    np.testing.assert_allclose(test.frame(2).joints, joints[3], atol=1e-8)  # the third file is frame 3
+    surface = blob(icvl_module.INTRINSICS, joints[3].mean(0))
+    np.testing.assert_allclose(test.frame(2).depth[80:160, 100:220], surface[80:160, 100:220], atol=1e-6)
+    assert test.frame(2).depth[:80].max() == 0
+    assert test.frame(0).cube_side == 0.2
+    path = tmp_path / 'P2' / '1' / '000001_depth.bin'
+    path.write_bytes(path.read_bytes()[:-4])
+    with pytest.raises(DatasetError, match=r'000001_depth\.bin is damaged'):
+        test.frame(1)
+    with pytest.raises(DatasetError, match=r"no subject 'P9'"):
+        open_dataset('msra:P9', 'test', tmp_path)
+
+
+# Bags
+
+def test_bags(tmp_path):
+    rng, camera = np.random.default_rng(4), Intrinsics(300, 300, 160, 120, 320, 240)
+    (tmp_path / 'train').mkdir()
+    hands = []
+    with BagWriter(tmp_path / 'train' / 'mine.mcap') as bag:
+        for i, side in enumerate(('left', 'right', 'right')):
+            joints = scattered(rng, 21, np.array([0.1, 0.0, 0.5])).astype(np.float32)
+            hands.append(joints)
+            bag.write_depth(1000 + i, 'camera', blob(camera, joints.mean(0)), camera)
+            if i == 1:
+                continue  # a frame without a label
+            bag.write_hands(1000 + i, 'camera', [SimpleNamespace(
+                id='0', side=side, score=1.0, joints=joints, confidence=np.ones(21, np.float32),
+                cube=Cube((0.1, 0.0, 0.5), 0.3))], HAND21)
+    dataset = open_dataset('bags', 'train', tmp_path)
+    assert dataset.size == 2 and dataset.skeleton.name == 'hand21'
+    batch = dataset.batch(torch.tensor([1, 0]))
+    metres = joints_in_metres(batch['joints'], batch['cube_center'], batch['cube_side'])
+    np.testing.assert_allclose(metres[0], hands[2], atol=1e-5)
+    np.testing.assert_allclose(metres[1], hands[0] * (-1, 1, 1), atol=1e-5)  # a left hand is mirrored in
+    assert (batch['patch'] < 1).float().mean() > 0.05
+    with pytest.raises(DatasetError, match='val holds no bags'):
+        open_dataset('bags', 'val', tmp_path)
+
+
+# All of them
+
+def test_the_crop_is_centred_on_what_is_there():
+    camera = Intrinsics(300, 300, 160, 120, 320, 240)
+    cube = center_of_mass_cube(blob(camera, np.array([0.04, 0.02, 0.5])), Cube((0.0, 0.0, 0.52), 0.3), camera)
+    np.testing.assert_allclose(camera.project(cube.center), camera.project([0.04, 0.02, 0.5]), atol=0.5)
+    assert 0.44 < cube.center[2] < 0.48
+    nothing = Cube((0.0, 0.0, 2.0), 0.3)
+    assert center_of_mass_cube(np.zeros((240, 320), np.float32), nothing, camera) == nothing
+
+
+def test_synthetic_hands_are_right_hands_to_the_network():
+    from hand_pose_ros.synthetic.generator import SyntheticHands
+    scene = SyntheticHands('val').batch(torch.arange(64))
+    seen = open_dataset('synthetic', 'val').batch(torch.arange(64))
+    left = scene['side'] == 1
+    assert left.any() and not left.all()
+    expected = scene['joints_m'].clone()
+    expected[left, :, 0] *= -1
+    metres = joints_in_metres(seen['joints'], seen['cube_center'], seen['cube_side'])
+    torch.testing.assert_close(metres[seen['hand_present']], expected[seen['hand_present']], atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(('name', 'split', 'message'), [
+    ('nyuu', 'train', "unknown dataset 'nyuu'"), ('nyu', 'train', r'joint_data\.mat is missing'),
+    ('msra', 'train', 'P2 with its gestures is missing'), ('bags', 'train', 'holds no bags'),
+    ('synthetic', 'tset', "unknown split 'tset'"), ('icvl', 'tset', "unknown split 'tset'")])
+def test_what_is_not_there_is_one_sentence(tmp_path, name, split, message):
+    with pytest.raises(DatasetError, match=message):
+        open_dataset(name, split, tmp_path)
+
+
+def test_shards_are_the_same_wherever_they_are_made_and_mended_when_damaged(tmp_path):
+    write_icvl(tmp_path / 'icvl', np.random.default_rng(5))
+    opening = partial(open_dataset, 'icvl', 'test', tmp_path / 'icvl')
+    memory = MemoryShards(opening(), 2)
+    disk = DiskShards(opening, tmp_path / 'cache', 2)
+    try:
+        disk.keep([0, 1])
+        for number, size in ((0, 2), (1, 1)):  # three frames
+            assert len(disk.read(number)['patch']) == size
+            for key, value in memory.read(number).items():
+                assert torch.equal(value, disk.read(number)[key])
+        good = disk.path(0).read_bytes()
+        for damage in (good[:-100], good[:-1] + bytes([good[-1] ^ 1]), b''):
+            disk.keep([])
+            disk.path(0).unlink()
+            disk.path(0).write_bytes(damage)
+            assert torch.equal(disk.read(0)['patch'], memory.read(0)['patch'])
+            assert disk.path(0).read_bytes() == good
+    finally:
+        disk.close()
+    assert not list((tmp_path / 'cache').rglob('*.tmp'))
+
+
+def test_a_missing_frame_stops_the_making_of_its_shard(tmp_path):
+    write_icvl(tmp_path / 'icvl', np.random.default_rng(5))
+    opening = partial(open_dataset, 'icvl', 'test', tmp_path / 'icvl')
+    shards = DiskShards(opening, tmp_path / 'cache', 2)
+    (tmp_path / 'icvl' / 'Depth' / 'test_seq_2' / 'image_0000.png').write_bytes(b'')
+    try:
+        with pytest.raises(DatasetError, match=r'test_seq_2/image_0000\.png is damaged'):
+            shards.read(1)
+    finally:
+        shards.close()
+
+
+def test_the_cache_forgets_what_was_used_longest_ago(tmp_path):
+    write_icvl(tmp_path / 'icvl', np.random.default_rng(5))
+    opening = partial(open_dataset, 'icvl', 'test', tmp_path / 'icvl')
+    shards = DiskShards(opening, tmp_path / 'cache', 1, limit_gb=1e-4)  # room for three
+    try:
+        for number in (0, 1, 2, 0):
+            assert shards.read(number)['joints'].shape == (1, 16, 3)
+    finally:
+        shards.close()
+    assert sum(path.stat().st_size for path in (tmp_path / 'cache').rglob('*.safetensors')) <= 100_000

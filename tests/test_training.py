@@ -1,0 +1,442 @@
+"""Training learns, can be stopped and continued anywhere, and gives the same result on any number of processes."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from hand_pose_ros.cli import main
+from hand_pose_ros.datasets import Batch, Dataset, icvl, joints_in_metres
+from hand_pose_ros.datasets.shards import MemoryShards
+from hand_pose_ros.errors import HandPoseError
+from hand_pose_ros.geometry import Cube, Intrinsics, crop
+from hand_pose_ros.models import build
+from hand_pose_ros.models.checkpoints import load_checkpoint
+from hand_pose_ros.models.prior import fit_prior
+from hand_pose_ros.skeleton import HAND21
+from hand_pose_ros.training.augmentation import PRESETS, Augmentation, augment
+from hand_pose_ros.training.folder import TrainingError
+from hand_pose_ros.training.loop import Machine, Run
+from hand_pose_ros.training.losses import joint_loss
+from hand_pose_ros.training.objectives import DenseObjective
+from hand_pose_ros.training.optimizers import learning_rate
+from hand_pose_ros.training.recipes import RECIPES, get_recipe, recipe_from_dict, recipe_to_dict
+from hand_pose_ros.training.stream import SampleStream
+
+TINY = ('dataset=icvl', 'network=shallow', 'options.bottleneck=8', 'batch_size=4', 'shard_size=4', 'val_every=40',
+        'samples=96')
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory) -> Path:
+    """A small dataset in ICVL's format: five balls around a sixth, which are the joints; and a cache."""
+    root = tmp_path_factory.mktemp('icvl')
+    rng = np.random.default_rng(0)
+    lines = []
+    for i in range(20):
+        name = f'{"201403121135" if i < 16 else "201405151126"}/image_{i:04d}.png'
+        joints = np.array([0, 0, 0.4]) + rng.uniform(-0.06, 0.06, (16, 3))
+        v, u = np.mgrid[:240, :320]
+        depth = np.zeros((240, 320))
+        for x, y, z in sorted(joints.tolist(), key=lambda joint: -joint[2]):
+            inside = (u - 160 - 241.42 * x / z) ** 2 + (v - 120 - 241.42 * y / z) ** 2 < 36
+            depth[inside] = 1000 * z
+        (root / 'Depth' / name).parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(root / 'Depth' / name), depth.round().astype(np.uint16))
+        uv = icvl.INTRINSICS.project(joints)
+        lines.append(name + ''.join(f' {a:.4f} {b:.4f} {1000 * z:.4f}' for (a, b), z in
+                                    zip(uv, joints[:, 2], strict=True)))
+    (root / 'labels.txt').write_text('\n'.join(lines))
+    return root
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def tiny(folder: Path, *overrides: str, recipe: str = 'paper', out: Path, **machine) -> Run:
+    recipe_ = get_recipe(recipe, [*TINY, f'root={folder}', *overrides])
+    return Run(out, recipe_, Machine(folder / 'cache', workers=0, **machine))
+
+
+# What a step sees
+
+class Numbered(Dataset):
+    """Samples that hold their own number."""
+
+    name, skeleton, fingerprint = 'numbered', HAND21, 'numbered'
+
+    def __init__(self, size: int | None) -> None:
+        self.size = size
+
+    def batch(self, indices: torch.Tensor) -> Batch:
+        return {'patch': torch.zeros(len(indices), 1), 'joints': indices.float()}
+
+
+@pytest.mark.parametrize('size', [None, 37])
+def test_every_sample_is_used_equally_often_and_a_step_is_a_function_of_its_number(size):
+    def stream(**options):
+        return SampleStream(MemoryShards(Numbered(size), 8), 8, seed=3, reuse=4, **options)
+    whole = stream()
+    steps = [whole.batch(step)[0]['joints'].int().tolist() for step in range(37)]
+    counts = np.bincount(np.concatenate(steps))
+    if size is None:  # but for the last shards, which later stages go on with
+        assert (counts[:6 * 8] == 4).all() and counts.max() == 4
+    else:
+        assert (counts == 8).all() and len(counts) == size  # 8 epochs
+    for step in (20, 3, 36):  # on its own, in any order
+        assert stream().batch(step)[0]['joints'].int().tolist() == steps[step]
+    halves = [stream(part=(rank, 2)).batch(5)[0]['joints'].int().tolist() for rank in range(2)]
+    assert sorted(halves[0] + halves[1]) == sorted(steps[5])
+    later = stream(first=2)
+    assert min(later.batch(0)[0]['joints']) >= 16
+
+
+# Augmentation
+
+CAMERA = Intrinsics(475, 475, 320, 240, 640, 480)
+
+
+def scene(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Depth of a wavy surface along the rays (x, y, 1); nothing beside it."""
+    z = 0.5 + 0.04 * np.sin(25 * x) + 0.03 * np.cos(30 * y)
+    return np.where((np.abs(x) < 0.25) & (np.abs(y - 0.05) < 0.2), z, 0).astype(np.float32)
+
+
+def sample(center: tuple[float, float, float] = (0.06, -0.04, 0.5), side: float = 0.3) -> Batch:
+    """Four copies of a crop of the scene, with joints on its surface."""
+    v, u = np.mgrid[:480, :640]
+    cube = Cube(center, side)
+    patch = crop(scene((u - 320) / 475, (v - 240) / 475), cube, CAMERA)
+    rays = np.random.default_rng(0).uniform(-0.1, 0.1, (30, 2)) + np.array(center[:2]) / center[2]
+    rays = rays[np.abs(rays[:, 1] - 0.05) < 0.18]
+    z = scene(rays[:, 0], rays[:, 1])
+    joints = cube.to_cube(np.stack([rays[:, 0] * z, rays[:, 1] * z, z], axis=1))
+    n = 4
+    return {'patch': torch.from_numpy(patch).expand(n, 1, 128, 128),
+            'joints': torch.from_numpy(joints).float().expand(n, -1, 3),
+            'cube_center': torch.tensor(center).expand(n, 3), 'cube_side': torch.full((n,), side),
+            'hand_present': torch.ones(n, dtype=torch.bool)}
+
+
+def test_augmentation_moves_patch_and_joints_alike_and_keeps_the_hand_rigid():
+    before = sample()
+    strong = Augmentation(rotation_deg=180, jitter=0.008, scale=1.2, mirror=0.5)
+    after = augment(before, strong, torch.arange(4), seed=1)
+    assert after['mirrored'].any() and not after['mirrored'].all()
+    columns, rows = ((after['joints'][..., :2] + 1) * 64 - 0.5).round().long().unbind(-1)
+    inside = (columns >= 0) & (columns < 128) & (rows >= 0) & (rows < 128)
+    assert inside.float().mean() > 0.8
+    seen = after['patch'][torch.arange(4)[:, None], 0, rows.clamp(0, 127), columns.clamp(0, 127)]
+    apart = (seen - after['joints'][..., 2]).abs()[inside]
+    assert apart.median() < 0.02  # the surface is where the joints on it are, up to a pixel of its slope
+    assert apart.max() < 0.1
+
+    metres = [joints_in_metres(b['joints'], b['cube_center'], b['cube_side']) for b in (before, after)]
+    torch.testing.assert_close(torch.cdist(metres[1], metres[1]), torch.cdist(metres[0], metres[0]), atol=2e-5, rtol=0)
+
+
+def test_a_moved_and_scaled_patch_is_the_crop_of_the_moved_and_scaled_cube():
+    after = augment(sample(), Augmentation(jitter=0.01, scale=1.2), torch.arange(4), seed=1)
+    v, u = np.mgrid[:480, :640]
+    depth = scene((u - 320) / 475, (v - 240) / 475)
+    for i in range(4):
+        cube = Cube(tuple(after['cube_center'][i].tolist()), float(after['cube_side'][i]))
+        patch = torch.from_numpy(crop(depth, cube, CAMERA))[0]
+        known = torch.ones(128, 128, dtype=torch.bool)
+        if cube.side > 0.3:  # what the old cube did not see stays unknown
+            border = int(64 * (1 - 0.3 / cube.side)) + 8
+            known[:border] = known[-border:] = known[:, :border] = known[:, -border:] = False
+        assert ((after['patch'][i, 0] - patch).abs() < 0.1)[known].float().mean() > 0.97
+
+
+def test_augmentation_depends_on_the_sample_and_not_on_its_neighbours():
+    batch, numbers = sample(), torch.tensor([7, 8, 9, 10])
+    together = augment(batch, PRESETS['modern'], numbers, seed=5)
+    alone = augment({key: value[2:3] for key, value in batch.items()}, PRESETS['modern'], numbers[2:3], seed=5)
+    for key, value in alone.items():
+        torch.testing.assert_close(value[0], together[key][2], atol=1e-6, rtol=0)
+    other = augment(batch, PRESETS['modern'], numbers, seed=6)
+    assert not torch.equal(other['joints'], together['joints'])
+
+
+def test_degraded_patches_stay_in_range_and_keep_the_background():
+    batch = sample()
+    after = augment(batch, Augmentation(noise=0.01, dropout=0.3, erase=1.0), torch.arange(4), seed=1)['patch']
+    assert after.min() >= -1 and after.max() <= 1
+    assert (after[batch['patch'] == 1] == 1).all()
+    lost = ((after == 1) & (batch['patch'] < 1)).float().sum() / (batch['patch'] < 1).sum()
+    assert 0.05 < lost < 0.5
+    assert torch.equal(augment(batch, Augmentation(), torch.arange(4), seed=1)['patch'], batch['patch'])
+
+
+def test_deep_prior_pp_changes_one_thing_at_a_time():
+    batch = {key: value[:1].expand(300, *value.shape[1:]) for key, value in sample().items() if key != 'patch'}
+    after = augment(batch, PRESETS['deep_prior_pp'], torch.arange(300), seed=1)
+    moved = (after['cube_center'][:, 2] != batch['cube_center'][:, 2])
+    turned = ~moved & (after['joints'] != batch['joints']).any(2).any(1)
+    assert 70 < moved.sum() < 130 and 70 < turned.sum() < 130 and (~moved & ~turned).sum() > 70
+
+
+# Losses and recipes
+
+def test_original_code_regresses_the_coefficients_of_the_prior():
+    """Squared error of the joints behind a fixed prior = squared error of its coefficients, up to a constant."""
+    poses = np.random.default_rng(0).normal(size=(200, 63)) * np.linspace(1, 0.01, 63)
+    prior = fit_prior(poses, 8)
+    truth = torch.from_numpy(poses[:5]).reshape(5, 21, 3)
+    everyone = torch.ones(5, dtype=torch.bool)
+    differences = []
+    for seed in range(2):
+        coefficients = np.random.default_rng(seed + 1).normal(size=(5, 8))
+        joints = torch.from_numpy(prior.reconstruct(coefficients)).reshape(5, 21, 3)
+        direct = ((coefficients - prior.project(poses[:5])) ** 2).sum(1).mean()
+        differences.append(float(joint_loss('squared', 0, joints, truth, everyone)) - direct)
+    assert differences[0] == pytest.approx(differences[1])
+
+
+def test_huber_is_of_the_distance_and_samples_that_do_not_count_add_nothing():
+    truth = torch.zeros(2, 21, 3)
+    joints = torch.zeros(2, 21, 3, requires_grad=True)
+    moved = joints + torch.tensor([0.3, 0.0, 0.4])
+    both = joint_loss('huber', 0.1, moved, truth, torch.tensor([True, True]))
+    assert float(both) == pytest.approx(21 * 0.1 * (0.5 - 0.05))  # delta (d - delta / 2)
+    one = joint_loss('huber', 0.1, moved, truth, torch.tensor([True, False]))
+    assert float(one) == pytest.approx(float(both) / 2)
+    one.backward()
+    assert joints.grad[0].abs().min(0).values.max() > 0 and joints.grad[1].abs().max() == 0
+    exact = torch.zeros(1, 21, 3, requires_grad=True)
+    joint_loss('huber', 0.1, exact, truth[:1], torch.tensor([True])).backward()
+    assert exact.grad.isfinite().all()
+
+
+def test_schedules():
+    original, modern = RECIPES['original-code'], RECIPES['modern']
+    assert learning_rate(original, 0) == pytest.approx(0.01 / 1.2)
+    assert learning_rate(original, 0.999) == pytest.approx(0.01 / (1 + 0.2 * 100))
+    assert learning_rate(RECIPES['paper'], 0.7) == 0.01
+    rates = [learning_rate(modern, progress) for progress in (0, modern.warmup, 0.5, 1)]
+    assert rates[0] == 0 and rates[1] > 0.99 * modern.learning_rate and rates[3] < 1e-9
+    assert rates[2] == pytest.approx(modern.learning_rate / 2)
+
+
+def test_any_value_of_a_recipe_can_be_replaced():
+    recipe = get_recipe('paper', ['samples=2e6', 'options.bottleneck=none', 'augmentation=modern',
+                                  'augmentation.jitter=0.01', 'learning_rate=1', 'base=a/b.safetensors',
+                                  'train_prior=false'])
+    assert (recipe.samples, recipe.options['bottleneck'], recipe.augmentation.jitter) == (2_000_000, None, 0.01)
+    assert recipe.augmentation.erase == PRESETS['modern'].erase
+    assert (recipe.learning_rate, recipe.base, recipe.train_prior) == (1.0, 'a/b.safetensors', False)
+    assert recipe_from_dict(json.loads(json.dumps(recipe_to_dict(recipe)))) == recipe
+    assert get_recipe('paper') == RECIPES['paper']
+
+
+@pytest.mark.parametrize(('override', 'message'), [
+    ('lr=1', "no 'lr'"), ('samples=many', 'not of type'), ('samples=1.5', 'not of type'), ('seed', 'key=value'),
+    ('augmentation=strong', 'choose one of'), ('augmentation.strong=1', "no 'strong'"), ('seed.x=1', 'is one value')])
+def test_a_wrong_override_is_one_sentence(override, message):
+    with pytest.raises(HandPoseError, match=message):
+        get_recipe('paper', [override])
+
+
+# Runs
+
+def test_training_learns_and_leaves_a_folder_that_tells_all(folder, tmp_path):
+    run = tiny(folder, 'network=deep', 'optimizer=adamw', 'learning_rate=0.002', 'samples=1600', 'batch_size=16',
+               'val_every=800', recipe='paper', out=tmp_path)
+    first = run.train()
+    # Twelve frames do not tell where scattered balls are in a new one, but those it was shown it knows.
+    shown = load_checkpoint(tmp_path / 'last.safetensors')
+    batch = run.shards.read(0)
+    with torch.no_grad():
+        error = (shown.network(batch['patch'].float()) - batch['joints']).norm(dim=-1).mean() * 125
+    assert error < 10 < first['val_mm']
+    assert shown.metadata['skeleton'] == 'icvl16' and shown.metadata['training_data'] == 'icvl-train'
+    lines = [json.loads(line) for line in (tmp_path / 'metrics.jsonl').read_text().splitlines()]
+    assert [line['samples'] for line in lines if 'val_mm' in line] == [800, 1600]
+    assert lines[0]['joints'] > 3 * [line for line in lines if 'joints' in line][-1]['joints']
+    config = json.loads((tmp_path / 'config.json').read_text())
+    assert recipe_from_dict(config['recipe']) == run.recipe and 'git' in config
+    assert (tmp_path / 'best.safetensors').exists() and (tmp_path / 'log.txt').stat().st_size > 0
+    with pytest.raises(TrainingError, match='holds a run already'):
+        tiny(folder, out=tmp_path).train()
+
+
+def test_the_prior_comes_from_the_training_poses_and_is_trained_on_unless_the_recipe_says_no(folder, tmp_path):
+    for recipe, trained_on in (('paper', True), ('original-code', False)):
+        run = tiny(folder, 'samples=16', 'augmentation=none', recipe=recipe, out=tmp_path / recipe)
+        poses = torch.cat([run.shards.read(0)['joints']] * 2)
+        head = run.objective.network.head
+        # Four poses span three dimensions: the first shard is what the prior was fitted on, so it holds them.
+        prior = fit_prior(poses, 8)
+        start = head.reconstruction.weight.detach().clone()
+        mean = torch.from_numpy(prior.mean)
+        torch.testing.assert_close(head.reconstruction.bias.detach().double(), mean, atol=1e-6, rtol=0)
+        centred = poses.flatten(1) - mean
+        torch.testing.assert_close((centred @ start.double()) @ start.T.double(), centred, atol=1e-5, rtol=0)
+        run.train()
+        assert torch.equal(head.reconstruction.weight.detach(), start) != trained_on
+
+
+def same_state(a: Path, b: Path) -> bool:
+    one, two = load_file(a / 'state.safetensors'), load_file(b / 'state.safetensors')
+    return one.keys() == two.keys() and all(torch.equal(one[key], two[key]) for key in one)
+
+
+MODERN = ('network=hand_dense', 'options={}', 'options.width=8')
+
+
+@pytest.mark.parametrize('recipe', ['paper', 'original-code', 'modern'])
+def test_a_stopped_run_continues_bit_for_bit(folder, tmp_path, recipe):
+    overrides = ('samples=48', *(MODERN if recipe == 'modern' else ()))
+    tiny(folder, *overrides, recipe=recipe, out=tmp_path / 'whole').train()
+    run = tiny(folder, *overrides, recipe=recipe, out=tmp_path / 'stopped')
+    step, train_step = [], run._train_step
+
+    def stopping(module):
+        step.append(1)
+        if len(step) == 7:  # in the middle of an epoch
+            os.kill(os.getpid(), signal.SIGTERM)
+        return train_step(module)
+    run._train_step = stopping
+    with pytest.raises(TrainingError, match=r'after 28 samples; continue with --resume'):
+        run.train()
+    again = tiny(folder, *overrides, recipe=recipe, out=tmp_path / 'stopped')
+    again.train(resume=True)
+    assert same_state(tmp_path / 'whole', tmp_path / 'stopped')
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def command(folder: Path, out: Path, *overrides: str) -> list[str]:
+    sets = [part for item in (*TINY, f'root={folder}', *overrides) for part in ('--set', item)]
+    return ['train', 'paper', '--out', str(out), '--cache', str(folder / 'cache'), '--threads', '1', *sets]
+
+
+def test_a_killed_run_continues_bit_for_bit(folder, tmp_path):
+    """SIGKILL at any moment, with samples made by another process, which must not outlive the run."""
+    script = ('import sys, hand_pose_ros.training.loop as loop; from functools import partial;'
+              'loop.Machine = partial(loop.Machine, save_every_s=0);'
+              'from hand_pose_ros.cli import main; sys.exit(main(sys.argv[1:]))')
+    long = ('samples=40_000', 'val_every=100_000')
+    arguments = command(folder, tmp_path, *long)
+    process = subprocess.Popen([sys.executable, '-c', script, *arguments], stderr=subprocess.DEVNULL)
+    state = tmp_path / 'state.safetensors'
+    while not state.exists() and process.poll() is None:
+        time.sleep(0.05)
+    time.sleep(0.5)
+    process.kill()
+    process.wait()
+    stopped_at = int(run_state(state)['step'])
+    assert 0 < stopped_at < 10_000
+    again = Run(tmp_path, get_recipe('paper', [*TINY, f'root={folder}', *long]), Machine(folder / 'cache', workers=0))
+    whole = tiny(folder, *long, out=tmp_path / 'whole')
+    for run, resume in ((again, True), (whole, False)):
+        stop_after(run, stopped_at + 5)
+        with pytest.raises(TrainingError, match='continue with --resume'):
+            run.train(resume)
+    assert same_state(tmp_path, tmp_path / 'whole')
+
+
+def run_state(path: Path) -> dict:
+    from safetensors import safe_open
+    with safe_open(path, 'pt') as file:
+        return json.loads(file.metadata()['json'])
+
+
+def stop_after(run: Run, step: int) -> None:
+    train_step = run._train_step
+
+    def stopping(module):
+        run._stop = run.step + 1 >= step
+        return train_step(module)
+    run._train_step = stopping
+
+
+def test_two_processes_give_the_result_of_one(folder, tmp_path):
+    overrides = ('samples=40', 'network=multi_scale', 'options.dropout=0.0', 'augmentation=modern')
+    script = 'import sys; from hand_pose_ros.cli import main; sys.exit(main(sys.argv[1:]))'
+    torchrun = [sys.executable, '-m', 'torch.distributed.run', '--nproc-per-node', '2', '--master-port', '0']
+    arguments = command(folder, tmp_path / 'two', *overrides)
+    result = subprocess.run([*torchrun, '--no-python', sys.executable, '-c', script, *arguments], timeout=110, text=True,
+                            capture_output=True, env={**os.environ, 'OMP_NUM_THREADS': '1'})
+    assert result.returncode == 0, result.stderr
+    assert main(command(folder, tmp_path / 'one', *overrides)) == 0
+    one, two = (load_file(tmp_path / name / 'state.safetensors') for name in ('one', 'two'))
+    for key, value in one.items():
+        torch.testing.assert_close(two[key], value, atol=1e-5, rtol=1e-4)
+
+
+def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_batch(folder, tmp_path):
+    run = tiny(folder, 'learning_rate=1e30', out=tmp_path)
+    with pytest.raises(TrainingError, match=r'step \d+ is not finite .* learning_rate below 1e\+30'):
+        run.train()
+    (saved,) = tmp_path.glob('failed_batch_*.safetensors')
+    assert load_file(saved)['patch'].shape == (4, 1, 128, 128)
+
+
+def test_a_refiner_learns_from_what_its_base_has_not_seen(folder, tmp_path):
+    tiny(folder, out=tmp_path / 'greedy', ).train()
+    with pytest.raises(TrainingError, match=r'trained on all of icvl-train.*last_shard=N'):
+        tiny(folder, 'refiner=or_ref', f'base={tmp_path / "greedy" / "last.safetensors"}', out=tmp_path / 'never')
+    tiny(folder, 'last_shard=2', out=tmp_path / 'base').train()
+    base = tmp_path / 'base' / 'last.safetensors'
+    run = tiny(folder, 'refiner=or_ref', f'base={base}', 'optimizer=adamw', 'learning_rate=0.001', 'samples=160',
+               out=tmp_path / 'refined')
+    assert list(run.stream.window(0)) == [2, 3]
+    run.train()
+    refined, before = load_checkpoint(tmp_path / 'refined' / 'last.safetensors'), load_checkpoint(base)
+    kept = refined.network.state_dict()
+    assert all(torch.equal(kept[key], value) for key, value in before.network.state_dict().items())
+    batch = run.shards.read(3)
+    with torch.no_grad():
+        estimate = refined.network(batch['patch'].float())
+        better = refined.refiner(batch['patch'].float(), estimate)
+    assert (better - batch['joints']).norm(dim=-1).mean() < (estimate - batch['joints']).norm(dim=-1).mean()
+    with pytest.raises(TrainingError, match='--set base=FILE'):
+        tiny(folder, 'refiner=or_ref', out=tmp_path / 'never')
+
+
+def test_the_heads_of_a_dense_network_are_trained_for_what_they_say():
+    """Each term falls when its head is right, and joints of mirrored or absent hands teach nothing."""
+    torch.manual_seed(0)
+    recipe = get_recipe('modern')
+    network = build('hand_dense', joints=21, width=8)
+    objective = DenseObjective(network, recipe, HAND21)
+    batch = sample()
+    batch = {**batch, 'joints': batch['joints'][:, :21], 'mirrored': torch.tensor([False, False, True, False]),
+             'hand_present': torch.tensor([True, True, True, False])}
+    before = {key: float(value) for key, value in objective(batch).items()}
+    optimizer = torch.optim.Adam(objective.parameters(), 0.01)
+    for _ in range(40):
+        optimizer.zero_grad()
+        sum(objective(batch).values()).backward()
+        optimizer.step()
+    after = {key: float(value) for key, value in objective(batch).items()}
+    assert before.keys() == after.keys() == {'joints', 'maps', 'confidence', 'hand', 'side', 'size'}
+    assert all(after[key] < before[key] for key in after)
+    changed = {**batch, 'joints': torch.where(torch.tensor([0, 0, 1, 1])[:, None, None] > 0, 9.0, batch['joints'])}
+    assert {key: float(value) for key, value in objective(changed).items()} == after
+
+
+def test_command_line(tmp_path, folder, capsys):
+    assert main(['train', 'papers', '--out', str(tmp_path)]) == 1
+    assert "unknown recipe 'papers'" in capsys.readouterr().err
+    assert main(['train', '--resume', '--out', str(tmp_path)]) == 1
+    assert 'holds no run to resume' in capsys.readouterr().err
+    for wrong in (['train', '--out', str(tmp_path)], ['train', 'paper', '--out', str(tmp_path), '--resume']):
+        with pytest.raises(SystemExit) as error:
+            main(wrong)
+        assert error.value.code == 2

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
 from itertools import islice
@@ -127,14 +127,15 @@ def evaluate_bags(paths: Sequence[str | Path], settings: Settings, jobs: int | N
     workers = max(1, min(jobs or cores, len(mine)))
     settings = replace(settings, num_threads=settings.num_threads or max(1, cores // workers))
     done: dict[str | Path, Result | HandPoseError] = {}
-    with ProcessPoolExecutor(workers, mp_context=get_context('spawn')) as pool:
+    # A single worker need not be another process, which would load everything again.
+    with ThreadPoolExecutor(1) if workers == 1 else ProcessPoolExecutor(workers, get_context('spawn')) as pool:
         futures = {pool.submit(_attempt, path, settings, (open_sinks or {}).get(path)): path for path in mine}
         finished = as_completed(futures)
         for future in progress(finished, len(futures)) if progress else finished:
             try:
                 done[futures[future]] = future.result()
-            except Exception as error:  # the process itself died: out of memory, say
-                done[futures[future]] = HandPoseError(f'{futures[future]}: the process that read it died ({error})')
+            except Exception as error:  # a defect of ours, or the process itself died: out of memory, say
+                done[futures[future]] = HandPoseError(f'{futures[future]}: stopped unexpectedly ({error!r})')
     if world > 1:
         done = _gather(done, rank, world)
     return {path: done[path] for path in paths if path in done}

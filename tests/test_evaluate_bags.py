@@ -1,0 +1,229 @@
+"""`hand-pose evaluate BAG`: the estimator over real bags, scored, timed, and with whatever is wrong said."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from hand_pose_ros.bags import Bag, BagWriter, read_hands
+from hand_pose_ros.cli import main
+from hand_pose_ros.estimator import HandEstimate
+from hand_pose_ros.evaluation.bag_evaluation import Settings, evaluate_bag
+from hand_pose_ros.evaluation.results import Result
+from hand_pose_ros.geometry import Cube, Intrinsics
+from hand_pose_ros.models import build
+from hand_pose_ros.models.checkpoints import save_checkpoint
+from hand_pose_ros.skeleton import HAND21
+
+CAMERA = Intrinsics(240, 240, 159.5, 119.5, 320, 240)
+FRAMES, STEP_NS = 12, 33_000_000
+
+
+def depth_image(k):
+    """A fist-sized ball that moves before a wall, with an arm."""
+    v, u = np.mgrid[:240, :320]
+    x, y = 120 + 4 * k, 100 + 2 * k
+    square = 1 - ((u - x) ** 2 + (v - y) ** 2) / 30**2
+    depth = np.where(square > 0, 0.5 - 0.05 * np.sqrt(np.maximum(square, 0)), 1.4).astype(np.float32)
+    depth[y + 20:, x - 9:x + 9] = 0.52
+    return depth
+
+
+def record(path, frames=FRAMES, truth=None, step_ns=STEP_NS):
+    with BagWriter(path) as bag:
+        for k in range(frames):
+            bag.write_depth(10**9 + k * step_ns, 'camera', depth_image(k), CAMERA, codec=None)
+            if truth is not None:
+                hand = HandEstimate(truth[k].astype(np.float32), HAND21.joint_names, np.ones(21, np.float32), 1.0,
+                                    'right', Cube((0, 0, 0.5), 0.3), 'a')
+                bag.write_hands(10**9 + k * step_ns, 'camera', [hand], HAND21, '/truth/joints')
+    return path
+
+
+@pytest.fixture(scope='module')
+def model(tmp_path_factory):
+    """Weights that were never trained: what is tested is not how good they are."""
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp('model') / 'untrained.safetensors'
+    save_checkpoint(path, build('deep_prior', joints=21), {'skeleton': 'hand21', 'cube_side': 0.3})
+    return str(path)
+
+
+@pytest.fixture(scope='module')
+def settings(model):
+    return Settings(model, 'cpu', num_threads=1, estimator={'min_score': 0.0})
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    return record(tmp_path_factory.mktemp('bag') / 'ball.mcap')
+
+
+@pytest.fixture(scope='module')
+def result(bag, settings):
+    return evaluate_bag(bag, settings)
+
+
+def arguments(bag, model, *more):
+    return ['evaluate', str(bag), '--model', model, '--device', 'cpu', '--min-score', '0', *map(str, more)]
+
+
+def test_every_image_is_estimated_twice_the_same(bag, settings, result):
+    again = evaluate_bag(bag, settings)
+    assert result.predictions.shape == (FRAMES, 21, 3) and np.isfinite(result.predictions).all()
+    assert result.predictions.tobytes() == again.predictions.tobytes()
+    assert result.stamps_ns.tolist() == [10**9 + k * STEP_NS for k in range(FRAMES)]
+    searched = evaluate_bag(bag, replace(settings, estimator={'min_score': 0.0, 'tracking': False})).predictions
+    moved = searched[-1].mean(0) - searched[0].mean(0)
+    assert moved[:2] == pytest.approx(np.array([4, 2]) * (FRAMES - 1) / 240 * 0.5, abs=0.02), 'it follows the ball'
+
+
+def test_stages_add_up_to_the_total(result):
+    stages = {stage: seconds for stage, seconds in result.seconds.items() if stage != 'total'}
+    assert {'read', 'decode', 'detect', 'crop', 'predict', 'uncrop'} <= set(stages)
+    share = np.sum(list(stages.values()), axis=0) / result.seconds['total']
+    assert (share <= 1).all() and np.median(share) > 0.8
+    assert set(result.summary()['latency_ms']['total']) == {'mean', 'p50', 'p90', 'p99', 'max'}
+
+
+@pytest.mark.parametrize('kind', ['topic', 'npz', 'npz with stamps', 'text'])
+def test_truth_from_a_topic_a_file_or_text_gives_the_same_error(tmp_path, model, result, kind):
+    truth = result.predictions + np.array([0.006, 0, 0.008])  # 10 mm off
+    bag = record(tmp_path / 'bag.mcap', truth=truth if kind == 'topic' else None)
+    source = tmp_path / ('truth.txt' if kind == 'text' else 'truth.npz')
+    if kind == 'topic':
+        source = '/truth/joints'
+    elif kind == 'npz':
+        np.savez(source, joints=truth)
+    elif kind == 'npz with stamps':  # in another order, a little late, one missing
+        np.savez(source, joints=truth[:0:-1], stamps_ns=result.stamps_ns[:0:-1] + 4_000_000)
+    else:
+        np.savetxt(source, np.concatenate([CAMERA.project(truth), 1000 * truth[..., 2:]], -1).reshape(FRAMES, -1))
+    code = main(arguments(bag, model, '--ground-truth', source, '--json', tmp_path / 'r.json',
+                          '--out', tmp_path / 'r.npz'))
+    got = json.loads((tmp_path / 'r.json').read_text())
+    assert code == 0 and got['frames'] == FRAMES - (kind == 'npz with stamps')
+    assert got['mean_mm'] == pytest.approx(10, abs=1e-3) and got['max_mm'] == pytest.approx(10, abs=1e-3)
+    assert got['error_jitter_mm'] == pytest.approx(0, abs=1e-3) and got['mean_rigid_aligned_mm'] < 1e-3
+    assert Result.load(tmp_path / 'r.npz').summary()['mean_mm'] == got['mean_mm']
+
+
+def test_truth_that_does_not_fit_is_refused(tmp_path, bag, model, result, capsys):
+    np.savez(tmp_path / 'few.npz', joints=result.predictions[:3])
+    np.savez(tmp_path / 'nyu.npz', joints=np.zeros((FRAMES, 14, 3)))
+    np.savez(tmp_path / 'late.npz', joints=result.predictions, stamps_ns=result.stamps_ns + 10**12)
+    np.savez(tmp_path / 'odd.npz', wrong=np.zeros(3))
+    for source, message in (
+            (tmp_path / 'few.npz', '3 labels for 12 images'), (tmp_path / 'nyu.npz', r'shape (12, 14, 3)'),
+            (tmp_path / 'late.npz', 'no label is within 10 ms'), (tmp_path / 'odd.npz', 'array joints'),
+            ('/truth/joints', 'HandJointsArray named /truth/joints'), ('truth.csv', 'no such file')):
+        assert main(arguments(bag, model, '--ground-truth', source)) == 1
+        assert message in capsys.readouterr().err
+
+
+def test_hands_go_into_a_bag_that_plays_beside_the_original(tmp_path, bag, model, result):
+    assert main(arguments(bag, model, '--out-bag', tmp_path / 'hands.mcap')) == 0
+    hands = read_hands(tmp_path / 'hands.mcap', '/hand/joints')
+    assert [message.stamp_ns for message in hands] == result.stamps_ns.tolist()
+    assert np.stack([message.joints[0] for message in hands]) == pytest.approx(result.predictions, abs=1e-6)
+    with Bag(tmp_path / 'hands.mcap') as written:
+        topics = {connection.topic for connection in written.connections}
+    assert {'/hand/joints', '/hand/skeleton'} <= topics
+    if 'rclpy' in sys.modules:  # markers are made with the messages of ROS
+        assert '/hand/markers' in topics
+
+
+def test_images_that_cannot_be_decoded_count_as_images_without_a_hand(tmp_path, settings):
+    path = tmp_path / 'bag.mcap'
+    with BagWriter(path) as bag:
+        for k in range(3):
+            bag.write_depth(10**9 + k, 'camera', depth_image(k)[:120] if k == 1 else depth_image(k), CAMERA, codec=None)
+    result = evaluate_bag(path, settings)
+    assert np.isnan(result.predictions).all((1, 2)).tolist() == [False, True, False]
+    assert '1 of 3 images could not be used' in result.notes[0] and '320x120' in result.notes[0]
+
+
+def test_a_damaged_bag_is_evaluated_up_to_the_damage(tmp_path, bag, model, capsys):
+    whole = bag.read_bytes()
+    cut = tmp_path / 'cut.mcap'
+    cut.write_bytes(whole[:int(len(whole) * 0.6)])
+    assert main(arguments(cut, model, '--json', tmp_path / 'r.json')) == 1
+    got = json.loads((tmp_path / 'r.json').read_text())
+    assert got['damaged'] and 0 < got['frames'] < FRAMES
+    assert 'cut short' in capsys.readouterr().err and 'before the damage' in got['notes'][0]
+
+
+def test_what_is_wrong_with_a_bag_is_said(tmp_path, model, capsys):
+    two = tmp_path / 'two.mcap'
+    with BagWriter(two) as bag:
+        for topic in ('/left/depth', '/right/depth'):
+            bag.write_depth(10**9, 'camera', depth_image(0), CAMERA, topic=topic, codec=None)
+    for bag, more, message in ((two, (), 'choose one of /left/depth, /right/depth'),
+                               (tmp_path / 'none.mcap', (), 'there is no such bag')):
+        assert main(arguments(bag, model, *more)) == 1
+        assert message in capsys.readouterr().err
+    assert main(arguments(two, model, '--depth-topic', '/left/depth')) == 0
+    with pytest.raises(SystemExit) as caught:
+        main(['evaluate', 'bag.mcap', '--via-ros', '--out-bag', 'x.mcap'])
+    assert caught.value.code == 2
+
+
+def test_real_bags_without_camera_info_need_intrinsics(shared_data, model, capsys):
+    for name in ('raw', 'compressedDepth'):
+        bag = shared_data / 'bags' / f'{name}.bag'
+        assert main(arguments(bag, model)) == 1
+        assert 'CameraInfo' in capsys.readouterr().err
+        assert main(arguments(bag, model, '--intrinsics', 210, 210, 212, 120)) == 0
+        assert 'raw: 1 frames' in capsys.readouterr().out.replace(name, 'raw')
+
+
+def test_many_bags_at_once_and_one_that_fails(tmp_path, bag, model, settings, capsys):
+    same_name = record(tmp_path / 'other' / 'ball.mcap', frames=4)
+    code = main(['evaluate', str(bag), str(tmp_path / 'none.mcap'), str(same_name), '--model', model, '--device', 'cpu',
+                 '--min-score', '0', '--json', str(tmp_path / 'all.json'), '--out', str(tmp_path / 'out'),
+                 '--out-bag', str(tmp_path / 'hands')])
+    captured = capsys.readouterr()
+    assert code == 1 and 'none.mcap: there is no such bag' in captured.err and '1 of 3 bags failed' in captured.err
+    got = json.loads((tmp_path / 'all.json').read_text())['bags']
+    assert [got[str(bag)]['frames'], got[str(same_name)]['frames']] == [FRAMES, 4]
+    results = sorted((tmp_path / 'out').iterdir())
+    assert len(results) == 2 and len(list((tmp_path / 'hands').iterdir())) == 2, 'equal names do not collide'
+    alone = evaluate_bag(bag, settings)
+    together = next(r for r in map(Result.load, results) if len(r.predictions) == FRAMES)
+    assert together.predictions.tobytes() == alone.predictions.tobytes()
+
+
+def test_processes_of_torchrun_share_the_bags(tmp_path, bag, model):
+    """Two processes that find each other as torchrun's do: each reads its share, the first has all results."""
+    other = record(tmp_path / 'other.mcap', frames=5)
+    with socket.socket() as free:
+        free.bind(('127.0.0.1', 0))
+        port = free.getsockname()[1]
+    code = 'import sys; from hand_pose_ros.cli import main; sys.exit(main())'
+    processes = [subprocess.Popen(
+        [sys.executable, '-c', code, 'evaluate', str(bag), str(other), '--model', model, '--device', 'cpu',
+         '--min-score', '0', '--json', str(tmp_path / f'{rank}.json')],
+        env={**os.environ, 'RANK': str(rank), 'WORLD_SIZE': '2', 'LOCAL_WORLD_SIZE': '2', 'MASTER_ADDR': '127.0.0.1',
+             'MASTER_PORT': str(port)}) for rank in range(2)]
+    assert [process.wait(timeout=100) for process in processes] == [0, 0]
+    assert not (tmp_path / '1.json').exists()
+    got = json.loads((tmp_path / '0.json').read_text())['bags']
+    assert {name: one['frames'] for name, one in got.items()} == {str(bag): FRAMES, str(other): 5}
+
+
+def test_the_live_node_answers_what_the_estimator_says(ros_domain, tmp_path, model, settings):
+    pytest.importorskip('rclpy', reason='ROS is not installed')
+    bag = record(tmp_path / 'slow.mcap', frames=8, step_ns=200_000_000)
+    assert main(arguments(bag, model, '--via-ros', '--json', tmp_path / 'r.json', '--out', tmp_path / 'r.npz')) == 0
+    got, live = json.loads((tmp_path / 'r.json').read_text()), Result.load(tmp_path / 'r.npz').predictions
+    answered = np.isfinite(live).all((1, 2))
+    assert answered.sum() == 8 - got['dropped'] > 4, 'a busy machine may drop an image'
+    until = int(np.argmin(answered)) if got['dropped'] else 8
+    assert live[:until] == pytest.approx(evaluate_bag(bag, settings).predictions[:until], abs=1e-5)
+    assert 0 < got['latency_ms']['image to joints']['p50'] < 2000

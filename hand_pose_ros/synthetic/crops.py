@@ -42,9 +42,8 @@ def crop(depth: Tensor, center: Tensor, side: Tensor, view: View) -> Tensor:
     inside = (((columns >= 0) & (columns < width))[:, None, :] & ((rows >= 0) & (rows < height))[:, :, None])
     source = rows.clamp(0, height - 1)[:, :, None] * width + columns.clamp(0, width - 1)[:, None, :]
     patch = depth.flatten(1).gather(1, source.flatten(1)).reshape(batch, PATCH_SIZE, PATCH_SIZE)
-    back = (at[:, 2] + half).float()[:, None, None]
-    patch = torch.where(inside & (patch != 0), patch, back)
-    return ((patch - center[:, 2, None, None]) / (side / 2)[:, None, None]).clamp(-1, 1)[:, None]
+    shown = ((patch - center[:, 2, None, None]) / (side / 2)[:, None, None]).clamp(-1, 1)
+    return torch.where(inside & (patch != 0), shown, 1)[:, None]
 
 
 def settle(depth: Tensor, view: View, side: float, nearest: int, otherwise: Tensor) -> Tensor:

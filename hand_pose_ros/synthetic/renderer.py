@@ -211,13 +211,11 @@ def box(center: Tensor, axes: Tensor, half: Tensor, view: View) -> Tensor:
         half: (B, 3) half lengths of the edges, in metres.
     """
     x, y = view.rays
-    enter, leave = None, None
+    enter, leave = torch.full_like(x, -torch.inf), torch.full_like(x, torch.inf)
     for axis, h in zip(axes.unbind(2), half.unbind(1), strict=True):
         ray = axis[:, 0, None, None] * x + (axis[:, 1, None, None] * y + axis[:, 2, None, None])
         ray = torch.where(ray.abs() < 1e-9, 1e-9, ray)
         c = dot(axis, center)
         one, two = (c - h)[:, None, None] / ray, (c + h)[:, None, None] / ray
-        near, far = torch.minimum(one, two), torch.maximum(one, two)
-        enter = near if enter is None else torch.maximum(enter, near)
-        leave = far if leave is None else torch.minimum(leave, far)
+        enter, leave = torch.maximum(enter, torch.minimum(one, two)), torch.minimum(leave, torch.maximum(one, two))
     return torch.where((enter < leave) & (enter > 0), 1 / enter, 0)

@@ -1,0 +1,56 @@
+"""synthetic-test-v1: 5,000 frames that no training sees, the same for everybody, recreated from their seed.
+
+    for batch in frames():
+        predict(batch['patch']) ...
+
+Frames are those of the split 'test', which shares no hand, pose or other random number with 'train' and 'val'. Their
+identity is a SHA-256 over the first frames. It covers every bit, so it also tells when another version of PyTorch or
+another processor rounds differently; `digest` then still agrees to about a thousandth, and so do results.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from hand_pose_ros.synthetic.generator import SyntheticHands
+
+NAME = 'synthetic-test-v1'
+FRAMES = 5000
+PREFIX = 64
+SENSORS = ('primesense', 'kinect1', 'sr305', 'kinect2', 'azure', 'pmd', 'senz3d', 'd435', 'd415')
+
+PREFIX_SHA256 = ''
+"""Of the first PREFIX frames, made with PREFIX_MADE_WITH."""
+PREFIX_MADE_WITH = ''
+PREFIX_DIGEST = (0.0, 0.0, 0.0)
+
+
+def frames(number: int = FRAMES, *, device: str | torch.device = 'cpu', batch: int = 64) -> Iterator[dict[str, Tensor]]:
+    """The first `number` frames in batches, as of SyntheticHands.batch."""
+    hands = SyntheticHands('test', sensors=SENSORS, device=device)
+    for indices in torch.arange(number).split(batch):
+        yield hands.batch(indices)
+
+
+def checksum(batch: dict[str, Tensor]) -> str:
+    """SHA-256 of all that a batch holds, keys in alphabetical order."""
+    digest = hashlib.sha256()
+    for key in sorted(batch):
+        digest.update(key.encode())
+        digest.update(batch[key].cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
+def digest(batch: dict[str, Tensor]) -> tuple[float, float, float]:
+    """Mean of the patches, root mean square of the joints (cube units) and share of visible joints."""
+    return (float(batch['patch'].double().mean()), float(batch['joints'].double().square().mean().sqrt()),
+            float(batch['visible'].double().mean()))
+
+
+def made_with() -> str:
+    """What the last bit of a frame depends on beside this code."""
+    return f'torch {torch.__version__.split("+")[0]}, {torch.backends.cpu.get_cpu_capability()}'

@@ -1,0 +1,227 @@
+"""What the generator of synthetic hands promises to those who train on it."""
+
+import numpy as np
+import pytest
+import torch
+
+from hand_pose_ros.detection import detect
+from hand_pose_ros.geometry import Cube, Intrinsics
+from hand_pose_ros.geometry import crop as crop_one
+from hand_pose_ros.synthetic import benchmark, effects, sensors
+from hand_pose_ros.synthetic.crops import crop, settle
+from hand_pose_ros.synthetic.effects import Shot
+from hand_pose_ros.synthetic.generator import LEFT, SPLITS, SyntheticHands
+from hand_pose_ros.synthetic.renderer import View
+from hand_pose_ros.synthetic.rng import Random
+from hand_pose_ros.synthetic.sensors import SENSORS
+from hand_pose_ros.synthetic.stages import Ingredients
+
+CHUNK = 24  # smaller than by default: quick
+
+
+@pytest.fixture(scope='module')
+def hands() -> SyntheticHands:
+    return SyntheticHands('train', chunk=CHUNK)
+
+
+@pytest.fixture(scope='module')
+def batch(hands):
+    return hands.batch(torch.arange(2 * CHUNK))
+
+
+def test_batch_has_what_training_needs(batch):
+    n = 2 * CHUNK
+    assert batch['patch'].shape == (n, 1, 128, 128) and batch['patch'].dtype == torch.float32
+    assert batch['joints'].shape == batch['joints_m'].shape == (n, 21, 3)
+    assert batch['cube_center'].shape == (n, 3) and batch['cube_side'].shape == (n,)
+    assert batch['visible'].shape == (n, 21) and batch['visible'].dtype == torch.bool
+    for name, values in batch.items():
+        assert len(values) == n and torch.isfinite(values.float()).all(), name
+    assert batch['patch'].abs().max() <= 1
+    assert set(batch['side'].tolist()) == {1, 2}, 'both hands'
+    assert len(set(batch['sensor'].tolist())) > 5, 'many sensors'
+    assert not batch['visible'][~batch['hand_present']].any()
+
+
+def test_a_sample_depends_on_its_split_and_index_only(hands, batch):
+    order = torch.tensor([31, 7, 2, 40])
+    again = hands.batch(order)
+    alone = hands.batch(order[1:2])
+    for name, values in batch.items():
+        assert torch.equal(again[name], values[order]), name
+        assert torch.equal(alone[name], values[7:8]), name
+
+
+def test_splits_share_nothing(batch):
+    seen = batch['joints_m'][:8]
+    for split in SPLITS[1:]:
+        other = SyntheticHands(split, chunk=8).batch(torch.arange(8))['joints_m']
+        bones = [(j[:, 9] - j[:, 0]).norm(dim=-1) for j in (seen, other)]
+        assert not (bones[0][:, None] - bones[1][None]).abs().lt(1e-6).any(), 'the same hand in two splits'
+    base = SyntheticHands('train', seed_base=1, chunk=8).batch(torch.arange(8))['joints_m']
+    assert not torch.isclose(base, seen).all(-1).any()
+
+
+def test_joints_in_cube_units_are_the_joints_in_metres(batch):
+    for i in batch['hand_present'].nonzero()[:, 0].tolist():
+        cube = Cube(tuple(batch['cube_center'][i].tolist()), float(batch['cube_side'][i]))
+        expected = cube.to_cube(batch['joints_m'][i].numpy())
+        if batch['side'][i] == LEFT:
+            expected[:, 0] *= -1
+        np.testing.assert_allclose(batch['joints'][i].numpy(), expected, atol=2e-5)
+
+
+def test_patches_show_right_hands_only(batch):
+    """In cube units the thumb of an open right hand is where a right hand's must be: the sign of a triple product."""
+    j = batch['joints'][batch['hand_present']].double()
+    palm = torch.linalg.cross(j[:, 5] - j[:, 17], j[:, 9] - j[:, 0])  # from thumb side x to fingers: out of the palm
+    bent = (j[:, [8, 12, 16, 20]].mean(1) - j[:, [5, 9, 13, 17]].mean(1) - 0.8 * (j[:, 9] - j[:, 0]))
+    towards = (palm * bent).sum(1)
+    assert (towards > 0).float().mean() > 0.85, 'fingers bend to the palm of a right hand'
+
+
+def test_visible_joints_lie_just_behind_the_surface():
+    clean = SyntheticHands('val', ingredients=Ingredients(noise=False), chunk=CHUNK).batch(torch.arange(CHUNK))
+    z = clean['joints'][..., 2]
+    column, row = (((clean['joints'][..., i] + 1) * 64 - 0.5).round().long() for i in (0, 1))
+    inside = (column >= 0) & (column < 128) & (row >= 0) & (row < 128)
+    shown = clean['visible'] & inside
+    at = row.clamp(0, 127) * 128 + column.clamp(0, 127)
+    surface = clean['patch'].flatten(1).gather(1, at)
+    behind_mm = (z - surface) * clean['cube_side'][:, None] / 2 * 1e3
+    cut = surface <= -1  # before the cube's front face the depth is not known
+    deep = behind_mm[shown & ~cut]
+    assert len(deep) > 150
+    assert deep.quantile(0.02) > 0, 'a visible joint is not in front of the surface'
+    assert deep.quantile(0.98) < 40 and deep.median() > 4
+    hidden = behind_mm[clean['hand_present'][:, None] & ~clean['visible'] & inside & ~cut]
+    assert len(hidden) == 0 or hidden.median() > deep.median()
+
+
+def test_batched_crop_equals_the_products_crop():
+    rng = np.random.default_rng(3)
+    depth = np.where(rng.random((4, 150, 140)) < 0.2, 0, rng.uniform(0.3, 0.8, (4, 150, 140))).astype(np.float32)
+    centers = torch.tensor([[0.01, -0.02, 0.5], [0.2, 0.1, 0.45], [-0.05, 0.3, 0.61], [0.0, 0.0, 0.55]])
+    sides = torch.tensor([0.3, 0.25, 0.36, 0.3])
+    fx, fy, cx, cy = (torch.tensor(v) for v in ([241.4, 180.0, 200.3, 588.0], [241.4, 181.0, 200.3, 587.1],
+                                                [70.2, 60.0, 71.5, 69.5], [75.5, 70.0, 60.25, 74.5]))
+    patches = crop(torch.from_numpy(depth), centers, sides, View(fx, fy, cx, cy, 150, 140))
+    for i in range(4):
+        camera = Intrinsics(float(fx[i]), float(fy[i]), float(cx[i]), float(cy[i]), 140, 150)
+        expected = crop_one(depth[i], Cube(tuple(centers[i].tolist()), float(sides[i])), camera)
+        np.testing.assert_array_equal(patches[i].numpy(), expected)
+
+
+def test_detector_rule_agrees_with_the_product(hands):
+    """On whole noisy frames of one hand the product settles where the generator says it does."""
+    one = SyntheticHands('val', sensors=['kinect2'], chunk=8, ingredients=Ingredients(scenes=False))
+    off = []
+    for index in range(8):
+        depth, camera, joints, side = one.full_frame(index)
+        found = detect(depth, camera)
+        if side == 'none' or not found:
+            continue
+        v = View(*(torch.tensor([x]) for x in (camera.fx, camera.fy, camera.cx, camera.cy)), *depth.shape)
+        image = torch.from_numpy(depth)[None, 2::4, 2::4]
+        v = View(v.fx / 4, v.fy / 4, (v.cx - 2) / 4, (v.cy - 2) / 4, *image.shape[1:])
+        ours = settle(image, v, 0.30, 24, otherwise=torch.tensor(joints.mean(0))[None])
+        off.append(np.linalg.norm(ours[0].numpy() - found[0].center))
+    assert len(off) >= 5
+    assert np.median(off) < 0.01
+
+
+def test_crops_are_centred_as_the_product_does_it(batch):
+    distance = batch['joints'][batch['hand_present']].mean(1) * batch['cube_side'][batch['hand_present'], None] / 2
+    norm = distance.norm(dim=-1)
+    assert 0.005 < norm.median() < 0.05, 'centres are neither perfect nor astray'
+    assert norm.max() < 0.2
+
+
+@pytest.mark.parametrize('name', [s.name for s in SENSORS])
+def test_sensors_read_a_wall_right_and_nothing_as_nothing(name):
+    sensor = sensors.get_sensor(name)
+    near, far = SENSORS[sensor].hand_distance
+    z = (near + far) / 2
+    clean = torch.zeros(4, 90, 100)
+    clean[:, 20:, :] = 1 / z
+    focal = sensors.sensor_table('fx', torch.device('cpu'))[[sensor] * 4]
+    depth = sensors.sense(clean, torch.arange(4), torch.tensor([sensor] * 4), focal, torch.tensor([False, True] * 2))
+    assert torch.isfinite(depth).all() and (depth >= 0).all()
+    wall = depth[:, 24:]
+    assert (wall > 0).float().mean() > 0.85
+    assert not depth[:, :16].any()
+    error = (wall[wall > 0] - z).abs()
+    assert error.median() < 0.004 and error.quantile(0.9) < 0.02
+    assert error.max() > 0, 'no sensor is perfect'
+
+
+def _shot(batch: int, sensor: str, mirrored: bool = False) -> Shot:
+    s = SENSORS[sensors.get_sensor(sensor)]
+    as_tensor = lambda value: torch.full((batch, 1, 1), value)  # noqa: E731
+    return Shot(Random(torch.arange(batch)), as_tensor(s.intrinsics.fx), as_tensor(1.0), as_tensor(1.0),
+                as_tensor(mirrored), as_tensor(s.baseline), as_tensor(s.noise), as_tensor(max(s.step, 1e-3)),
+                as_tensor(s.smoothing), 60, 120)
+
+
+def test_shadow_is_on_one_side_and_as_wide_as_the_disparity_step():
+    clean = torch.full((1, 60, 120), 1 / 1.0)
+    clean[:, :, 60:80] = 1 / 0.8
+    expected = 588.03 * 0.075 * (1 / 0.8 - 1 / 1.0)
+    for mirrored, side in ((False, slice(0, 60)), (True, slice(80, 120))):
+        lost = effects.shadow(clean, _shot(1, 'primesense', mirrored)) == 0
+        assert abs(int(lost[0, 30].sum()) - expected) <= 1.5
+        assert lost[0, 30, side].sum() == lost[0, 30].sum()
+
+
+def test_disparity_comes_in_steps_that_grow_with_distance():
+    for z in (0.6, 1.2):
+        ramp = torch.linspace(1 / z, 1 / (z + 0.05), 120).expand(1, 60, 120)
+        depth = 1 / effects.disparity_noise(ramp, _shot(1, 'primesense'))
+        steps = depth.unique().diff()
+        assert steps[steps > 1e-5].median() == pytest.approx(z * z / (588.03 * 0.075) / 8, rel=0.15)
+
+
+def test_grazing_surfaces_are_lost_and_frontal_ones_are_not():
+    v = View(*(torch.tensor([t]) for t in (588.0, 588.0, 60.0, 30.0)), 60, 120)
+    from hand_pose_ros.synthetic.renderer import plane
+    for tangent, lost in ((0.3, False), (12.0, True)):
+        normal = torch.tensor([[tangent, 0.0, 1.0]])
+        image = plane(normal, torch.tensor([0.6]), v)
+        assert (effects.grazing_holes(image, _shot(1, 'primesense')) > 0).float().mean() < 0.05 if lost else (
+            effects.grazing_holes(image, _shot(1, 'primesense')) > 0).float().mean() > 0.95
+
+
+@pytest.mark.parametrize('without', ['surface', 'poses', 'forearm', 'scenes', 'noise', 'detector'])
+def test_each_ingredient_can_be_left_out(without, batch):
+    plain = SyntheticHands('train', chunk=CHUNK, ingredients=Ingredients(**{without: False})).batch(torch.arange(CHUNK))
+    assert torch.isfinite(plain['patch']).all()
+    changed = 'joints_m' if without == 'poses' else 'patch'
+    assert not torch.equal(plain[changed], batch[changed][:CHUNK])
+    if without != 'poses':
+        assert torch.equal(plain['joints_m'], batch['joints_m'][:CHUNK]), 'the same hands'
+
+
+def test_full_frame_and_moving_hand():
+    one = SyntheticHands('val', sensors=['sr305'], chunk=8)
+    frames = list(one.sequence(3, 4))
+    sides = {side for *_, side in frames}
+    assert len(sides) == 1 and sides <= {'left', 'right'}
+    for depth, camera, joints, _ in frames:
+        camera.check_size(*depth.shape[::-1])
+        assert depth.dtype == np.float32 and np.isfinite(depth).all() and (depth > 0).any()
+        u, v = camera.project(joints).round().astype(int).T
+        seen = depth[np.clip(v, 0, 479), np.clip(u, 0, 639)]
+        assert np.median(np.abs(seen[seen > 0] - joints[seen > 0, 2])) < 0.06, 'the hand is where its joints are'
+    moved = np.linalg.norm(frames[1][2] - frames[0][2], axis=-1)
+    assert moved.max() < 0.03, 'smoothly'
+    assert not np.array_equal(frames[0][0], frames[1][0])
+    again = list(one.sequence(3, 4))
+    assert np.array_equal(again[2][0], frames[2][0])
+
+
+def test_benchmark_is_the_frozen_one():
+    batch = next(benchmark.frames(benchmark.PREFIX, batch=benchmark.PREFIX))
+    np.testing.assert_allclose(benchmark.digest(batch), benchmark.PREFIX_DIGEST, atol=2e-3)
+    if benchmark.made_with() != benchmark.PREFIX_MADE_WITH:
+        pytest.skip(f'frozen with {benchmark.PREFIX_MADE_WITH}; {benchmark.made_with()} may round differently')
+    assert benchmark.checksum(batch) == benchmark.PREFIX_SHA256

@@ -1,0 +1,158 @@
+"""The renderer against closed forms, brute force and its own labels."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from hand_pose_ros.synthetic import renderer
+from hand_pose_ros.synthetic.renderer import View, depth_of, rasterise
+
+SIZE = 96
+
+
+def view(batch: int = 1, focal: float = 200.0, height: int = SIZE, width: int = SIZE + 8) -> View:
+    one = torch.ones(batch)
+    return View(focal * one, 1.02 * focal * one, 50.3 * one, 47.6 * one, height, width)
+
+
+def points(depth: Tensor, v: View) -> Tensor:
+    """(B, H, W, 3) in metres."""
+    x, y = v.rays
+    return torch.stack([x * depth, y * depth, depth], -1).double()
+
+
+def icosphere(times: int) -> tuple[Tensor, Tensor]:
+    t = (1 + math.sqrt(5)) / 2
+    corners = torch.tensor([(-1, t, 0), (1, t, 0), (-1, -t, 0), (1, -t, 0), (0, -1, t), (0, 1, t), (0, -1, -t),
+                            (0, 1, -t), (t, 0, -1), (t, 0, 1), (-t, 0, -1), (-t, 0, 1)])
+    faces = torch.tensor([(0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4),
+                          (11, 10, 2), (10, 7, 6), (7, 1, 8), (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8), (3, 8, 9),
+                          (4, 9, 5), (2, 4, 11), (6, 2, 10), (8, 6, 7), (9, 8, 1)])
+    for _ in range(times):
+        a, b, c = (corners[faces[:, i]] for i in range(3))
+        ab, bc, ca = (len(corners) + torch.arange(3 * len(faces))).reshape(3, -1)
+        corners = torch.cat([corners, (a + b) / 2, (b + c) / 2, (c + a) / 2])
+        faces = torch.cat([torch.stack(f, 1) for f in ((faces[:, 0], ab, ca), (faces[:, 1], bc, ab),
+                                                       (faces[:, 2], ca, bc), (ab, bc, ca))])
+    return corners / corners.norm(dim=1, keepdim=True), faces
+
+
+def test_triangle_has_the_depth_of_its_plane_inside_and_nothing_outside():
+    corners = torch.tensor([[[-0.08, -0.06, 0.5], [0.02, 0.09, 0.8], [0.1, -0.07, 0.6]]])
+    normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    faces = torch.tensor([[0, 1, 2]]) if (normal * corners[:, 0]).sum() < 0 else torch.tensor([[0, 2, 1]])
+    v = view()
+    image = rasterise(corners, faces, v)
+    # Brute force: the ray meets the triangle's plane at weights w of its corners, all positive inside.
+    x, y = v.rays
+    rays = torch.stack(torch.broadcast_tensors(x, y, torch.ones(1, 1, 1)), -1).double()
+    weights = rays @ torch.linalg.inv(corners[0].double())
+    depth = 1 / weights.sum(-1)
+    inside = weights.amin(-1) > 1e-3
+    assert inside.sum() > 500
+    torch.testing.assert_close(depth_of(image)[inside].double(), depth[inside], rtol=1e-4, atol=0)
+    assert not image[weights.amin(-1) < -1e-3].any()
+    assert not rasterise(corners, faces.flip(1), v).any(), 'a triangle seen from behind is not drawn'
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10 ** 6))
+def test_overlapping_triangles_equal_brute_force(seed):
+    generator = torch.Generator().manual_seed(seed)
+    middle = torch.tensor([0.0, 0.0, 0.5]) + torch.randn(6, 1, 3, generator=generator) * torch.tensor([0.1, 0.1, 0.05])
+    size = 10 ** (-1.2 - 1.5 * torch.rand(6, 1, 1, generator=generator))
+    triangles = middle + torch.randn(6, 3, 3, generator=generator) * size
+    v = view(focal=150.0)
+    image = rasterise(triangles.reshape(1, 18, 3), torch.arange(18).reshape(6, 3), v)
+    x, y = v.rays
+    rays = torch.stack(torch.broadcast_tensors(x, y, torch.ones(1, 1, 1)), -1)[0].double()
+    expected = torch.zeros(v.height, v.width, dtype=torch.float64)
+    doubtful = torch.zeros_like(expected, dtype=torch.bool)
+    for corners in triangles.double():
+        normal = torch.linalg.cross(corners[1] - corners[0], corners[2] - corners[0])
+        if normal @ corners[0] >= 0 or corners[:, 2].min() < renderer.NEAR:
+            continue
+        weights = rays @ torch.linalg.inv(corners)
+        share = weights * corners[:, 2] / (weights * corners[:, 2]).sum(-1, keepdim=True)
+        edge = share.amin(-1)
+        doubtful |= edge.abs() < 2e-3
+        expected = torch.where(edge > 0, torch.maximum(expected, weights.sum(-1)), expected)
+    sure = ~doubtful
+    torch.testing.assert_close(image[0][sure].double(), expected[sure], rtol=2e-3, atol=0)
+
+
+def test_mesh_of_a_ball_looks_like_the_ball():
+    corners, faces = icosphere(4)
+    center, v = torch.tensor([[0.03, -0.02, 0.5]]), view()
+    mesh = rasterise(corners[None] * 0.08 + center, faces, v)
+    ball = renderer.ellipsoid(center, torch.eye(3)[None], torch.full((1, 3), 0.08), v)
+    assert ((mesh > 0) != (ball > 0)).float().mean() < 0.004
+    both = (mesh > 0) & (ball > 0)
+    assert (depth_of(mesh) - depth_of(ball))[both].abs().quantile(0.98) < 6e-4
+    away = points(depth_of(ball), v)[ball > 0] - center.double()
+    torch.testing.assert_close(away.norm(dim=-1), torch.full_like(away[:, 0], 0.08), rtol=1e-4, atol=0)
+    middle = [round(float(t)) for t in v.project(center[:, None])]
+    assert depth_of(ball)[0, middle[1], middle[0]] == pytest.approx(0.42, abs=2e-3)
+
+
+def test_mesh_that_leaves_the_image_is_cut_and_not_wrapped_around():
+    corners, faces = icosphere(3)
+    v = view()
+    small = rasterise(corners[None] * 0.1 + torch.tensor([-0.1, 0.1, 0.5]), faces, v)
+    wide = View(v.fx, v.fy, v.cx + 60, v.cy + 60, v.height + 120, v.width + 120)
+    large = rasterise(corners[None] * 0.1 + torch.tensor([-0.1, 0.1, 0.5]), faces, wide)
+    torch.testing.assert_close(small, large[:, 60:-60, 60:-60], rtol=1e-5, atol=0)
+
+
+def test_plane_is_exact():
+    normal, v = torch.tensor([[0.2, -0.3, 0.933]]), view()
+    depth = depth_of(renderer.plane(normal, torch.tensor([0.7]), v))
+    torch.testing.assert_close(points(depth, v) @ normal[0].double(), torch.full((1, SIZE, SIZE + 8), 0.7).double(),
+                               rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize('radii', [(0.05, 0.02), (0.02, 0.05), (0.03, 0.03)])
+def test_round_cone_is_the_union_of_its_balls(radii):
+    start, end, v = torch.tensor([[-0.05, 0.02, 0.5]]), torch.tensor([[0.08, -0.03, 0.6]]), view()
+    a, b = (torch.tensor([r]) for r in radii)
+    cone = renderer.round_cone(start, end, a, b, v)
+    balls = torch.zeros_like(cone)
+    for part in torch.linspace(0, 1, 150):
+        radius = (a + part * (b - a))[:, None].expand(1, 3)
+        ball = renderer.ellipsoid(start + part * (end - start), torch.eye(3)[None], radius, v)
+        balls = torch.maximum(balls, ball)
+    assert ((cone > 0) != (balls > 0)).sum() <= 4
+    both = (cone > 0) & (balls > 0)
+    torch.testing.assert_close(depth_of(cone)[both], depth_of(balls)[both], rtol=1e-3, atol=0)
+
+
+def test_box_shows_its_faces():
+    axes = torch.linalg.qr(torch.tensor([[[1.0, 0.3, -0.2], [0.1, 0.9, 0.4], [-0.5, 0.2, 1.0]]]))[0]
+    center, half, v = torch.tensor([[0.01, 0.02, 0.5]]), torch.tensor([[0.05, 0.03, 0.04]]), view()
+    image = renderer.box(center, axes, half, v)
+    local = (points(depth_of(image), v)[image > 0] - center.double()) @ axes[0].double() / half.double()
+    assert len(local) > 300
+    np.testing.assert_allclose(local.abs().amax(1), 1, atol=1e-3)
+
+
+def test_nothing_behind_the_camera_is_drawn():
+    v, back = view(), torch.tensor([[0.0, 0.0, -0.5]])
+    assert not renderer.ellipsoid(back, torch.eye(3)[None], torch.full((1, 3), 0.1), v).any()
+    assert not renderer.round_cone(back, back - 0.1, torch.tensor([0.05]), torch.tensor([0.05]), v).any()
+    assert not renderer.box(back, torch.eye(3)[None], torch.full((1, 3), 0.1), v).any()
+    assert not renderer.plane(torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([-0.5]), v).any()
+    corners, faces = icosphere(2)
+    assert not rasterise(corners[None] * 0.1 + back, faces, v).any()
+
+
+def test_a_sample_does_not_depend_on_its_batch():
+    corners, faces = icosphere(3)
+    many = torch.stack([corners * (0.03 + 0.01 * i) + torch.tensor([0.01 * i, 0, 0.4 + 0.05 * i]) for i in range(5)])
+    together = rasterise(many, faces, view(5))
+    for i in range(5):
+        assert torch.equal(rasterise(many[i:i + 1], faces, view(1))[0], together[i])

@@ -11,7 +11,7 @@ from hand_pose_ros.synthetic.shapes import Shape, mean_shape
 TOLERANCE, SQUEEZE = 0.002, 0.0045
 """Metres by which capsules may overlap: flesh gives way where parts touch, more so between neighbouring fingers."""
 
-_ROUNDS = 10
+_ROUNDS = 12
 
 # Capsules: 0-2 thumb, 3-14 index to little finger (three each), 15-18 the palm along the metacarpals.
 _PAIRS = torch.tensor(
@@ -85,6 +85,30 @@ def part_contacts(pose: Tensor) -> Tensor:
     return pose
 
 
+def bring_together(pose: Tensor, within: float) -> Tensor:
+    """Poses (B, P) of the average hand, where the thumb is closed until its tip touches the nearest fingertip.
+
+    Hands whose tips are further than `within` metres from touching stay as they are.
+    """
+    shape = mean_shape().to(pose.device)
+    steps = torch.zeros(6, len(POSE), device=pose.device)
+    for row, name in enumerate(('thumb_cmc_radial', 'thumb_cmc_palmar', 'thumb_cmc_roll', 'thumb_mcp_flexion', 'thumb_ip_flexion')):
+        steps[row + 1, INDEX[name]] = 0.01
+
+    def gap(angles: Tensor) -> Tensor:
+        tips = place_bones(shape, angles)[3][:, :, 3]
+        touching = shape.radii[:, :1, 2] + shape.radii[:, 1:, 2] - TOLERANCE
+        return ((tips[:, 1:] - tips[:, :1]).norm(dim=-1) - touching).abs().amin(1)
+
+    pose, near = pose.clone(), (gap(pose) < within).nonzero()[:, 0]
+    for _ in range(3):  # Newton steps on one number, along its gradient
+        value = gap((pose[near, None] + steps).reshape(-1, len(POSE))).reshape(-1, 6)
+        slope = (value[:, 1:] - value[:, :1]) / 0.01
+        step = (value[:, :1] / (slope.square().sum(1, keepdim=True) + 1e-4)).clamp(max=20) * slope
+        pose[near] -= (step @ (steps[1:] / 0.01)).clamp(-0.2, 0.2)
+    return pose
+
+
 _THUMB = slice(INDEX['thumb_cmc_radial'], INDEX['thumb_ip_flexion'] + 1)
 _FINGERS = slice(INDEX['index_mcp_flexion'], len(POSE))
 
@@ -98,7 +122,7 @@ def _open_hand(like: Tensor) -> Tensor:
 
 def _nudge(pose: Tensor, deep: Tensor) -> Tensor:
     """One step of poses (B, P) away from their overlaps (B, 6, 6)."""
-    amount = (deep / 0.010).clamp(0.12, 0.6) * (deep > 0)
+    amount = (deep / 0.015).clamp(0.03, 0.6) * (deep > 0)
     thumb = torch.lerp(pose[:, _THUMB], _open_hand(pose)[_THUMB], amount[:, 0, 1:].amax(1, keepdim=True))
     fingers = pose[:, _FINGERS].reshape(-1, 4, 4)  # MCP flexion and abduction, PIP and DIP flexion
     between = amount[:, 1:5, 1:5]

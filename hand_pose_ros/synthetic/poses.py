@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hand_pose_ros.synthetic.contact import part_contacts
+from hand_pose_ros.synthetic.contact import bring_together, part_contacts
 from hand_pose_ros.synthetic.kinematics import INDEX, POSE
 from hand_pose_ros.synthetic.rng import Random
 
@@ -60,7 +60,7 @@ _TABLE = (
     (2.0, 'SSSS', 'apart', 'tucked'), (2.0, 'SSSS', 'wide', 'tucked'), (1.0, 'SSSF', 'apart', 'pinky'),
     # pinches
     (3.0, 'PRRR', 'apart', 'index'), (2.0, 'PSSS', 'apart', 'index'), (2.0, 'PHGG', 'together', 'index'), (1.0, 'PFFF', 'together', 'index'),
-    (1.5, 'RPRR', 'apart', 'middle'), (1.0, 'SPSS', 'apart', 'middle'), (1.0, 'SSPS', 'apart', 'ring'), (1.0, 'SSSP', 'apart', 'pinky'),
+    (1.5, 'RPRR', 'apart', 'middle'), (1.0, 'SPSS', 'apart', 'middle'), (1.5, 'SSPS', 'apart', 'ring'), (1.5, 'SSSP', 'apart', 'pinky'),
     (2.0, 'PPRR', 'together', 'middle'), (1.5, 'PPPP', 'together', 'middle'), (1.5, 'GGGG', 'together', 'key'),
     # grasps around balls, cylinders, plates, pens
     (3.0, 'CCCC', 'apart', 'cup'), (2.0, 'RRRR', 'wide', 'cup'), (2.0, 'HHHH', 'apart', 'cup'), (3.0, 'GGGG', 'together', 'cup'),
@@ -122,7 +122,7 @@ def sample_poses(rng: Random) -> Tensor:
     """
     low, high = LIMITS.to(rng.device).T
     pose = torch.where(rng.chance(0.25, 1), _anything(rng), _gestures(rng))
-    noise = torch.deg2rad(rng.normal(1, std=3.5) + rng.normal(len(POSE), std=6.0))
+    noise = torch.deg2rad(rng.normal(1, std=3.5) + rng.normal(len(POSE), std=6.0)) * rng.uniform(1, low=0.4, high=1.3)
     noise[:, _ABDUCTION] *= 0.55
     noise[:, _ABDUCTION] += torch.deg2rad(rng.normal(1, std=2.5)) * pose.new_tensor([1.0, 0, 0.8, 1.6])
     pose = pose + noise
@@ -143,4 +143,7 @@ def sample_poses(rng: Random) -> Tensor:
     # The wrist: bent back a little, more with a closed hand (tenodesis), less with an open one.
     bend = -10 + 22 * rng.normal() - 10 * (closed.mean(1) - 0.4)
     pose[:, 0], pose[:, 1] = torch.deg2rad(bend), torch.deg2rad(-5 + 10 * rng.normal())
+    pose = torch.minimum(torch.maximum(pose, low), high)
+    # Thumb and fingertip rarely stop just short of each other.
+    pose = torch.where(rng.chance(0.6, 1), bring_together(pose, within=0.015), pose)
     return part_contacts(torch.minimum(torch.maximum(pose, low), high))

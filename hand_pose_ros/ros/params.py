@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import re
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
@@ -147,3 +149,14 @@ def markdown_table() -> str:
         default = str(row.default).lower() if isinstance(row.default, bool) else repr(row.default)
         lines.append(f'| `{ros_name(row)}` | {default} | {span} | {when} | {meta["description"]} |')
     return '\n'.join(lines)
+
+
+def yaml_file() -> str:
+    """All parameters with their defaults as a parameter file of ROS 2; the content of config/estimator.yaml."""
+    lines = ['# Parameters of the node `estimator` with their defaults. Ranges: hand-pose estimator --parameters',
+             '/**:', '  ros__parameters:']
+    for row in fields(Params):
+        value = json.dumps(row.default)  # which is YAML, too
+        lines += textwrap.wrap(row.metadata['description'], 100, initial_indent='    # ', subsequent_indent='    # ')
+        lines += [f'    {ros_name(row)}: {value}']
+    return '\n'.join(lines) + '\n'

@@ -1,0 +1,34 @@
+"""ros2 launch hand_pose_ros estimator.launch.py depth_topic:=/camera/camera/depth/image_rect_raw"""
+
+from pathlib import Path
+
+from launch.actions import DeclareLaunchArgument
+from launch.conditions import IfCondition
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+from launch import LaunchDescription
+
+SHARE = Path(__file__).resolve().parents[1]
+
+
+def generate_launch_description() -> LaunchDescription:
+    """The node, and RViz if asked for. The node configures and activates itself, so nothing else is needed."""
+    arguments = {
+        'depth_topic': ('/depth/image_rect', 'Depth image, without its transport; camera_info is beside it.'),
+        'params_file': (str(SHARE / 'config' / 'estimator.yaml'), 'Parameters of the node.'),
+        'namespace': ('', 'Namespace of the node and its topics.'),
+        'use_sim_time': ('false', 'Take the time from /clock (bags played with --clock).'),
+        'rviz': ('false', 'Show the hands in RViz.'),
+    }
+    return LaunchDescription([
+        *(DeclareLaunchArgument(name, default_value=value, description=about)
+          for name, (value, about) in arguments.items()),
+        Node(package='hand_pose_ros', executable='estimator', name='estimator', output='screen',
+             namespace=LaunchConfiguration('namespace'),
+             parameters=[LaunchConfiguration('params_file'), {'use_sim_time': LaunchConfiguration('use_sim_time')}],
+             remappings=[('depth/image_rect', LaunchConfiguration('depth_topic'))]),
+        Node(package='rviz2', executable='rviz2', arguments=['-d', str(SHARE / 'rviz' / 'hand_pose.rviz')],
+             parameters=[{'use_sim_time': LaunchConfiguration('use_sim_time')}],
+             condition=IfCondition(LaunchConfiguration('rviz'))),
+    ])

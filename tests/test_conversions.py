@@ -1,0 +1,204 @@
+"""Messages, markers, camera models and parameters, without a network in between."""
+
+import importlib.util
+from array import array
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+pytest.importorskip('rclpy', reason='needs ROS 2')
+pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
+
+import yaml
+from sensor_msgs.msg import CameraInfo, RegionOfInterest
+from std_msgs.msg import Header
+from visualization_msgs.msg import Marker
+
+from hand_pose_ros.drawing import FINGER_COLORS
+from hand_pose_ros.errors import HandPoseError, InputError
+from hand_pose_ros.estimator import HandEstimate
+from hand_pose_ros.geometry import Cube, Intrinsics
+from hand_pose_ros.resources import resource
+from hand_pose_ros.ros.camera import Camera
+from hand_pose_ros.ros.conversions import hand_from_msg, hands_to_msg, skeleton_to_msg, stamp_ns
+from hand_pose_ros.ros.diagnostics import depth_problem
+from hand_pose_ros.ros.markers import HandMarkers
+from hand_pose_ros.ros.params import Params, markdown_table, yaml_file
+from hand_pose_ros.skeleton import HAND21
+
+
+def header(seconds: int = 12, frame: str = 'camera') -> Header:
+    message = Header(frame_id=frame)
+    message.stamp.sec, message.stamp.nanosec = seconds, 34
+    return message
+
+
+def hand(name: str = 'hand_1', side: str = 'left', seed: int = 0) -> HandEstimate:
+    rng = np.random.default_rng(seed)
+    joints = rng.normal((0, 0, 0.5), 0.05, size=(21, 3)).astype(np.float32)
+    return HandEstimate(joints, HAND21.joint_names, rng.random(21, np.float32), 0.75, side,
+                        Cube((0.01, -0.02, 0.5), 0.3), name)
+
+
+def test_an_estimate_survives_the_way_through_a_message() -> None:
+    before = hand()
+    message = hands_to_msg(header(), [before], HAND21)
+    assert stamp_ns(message.header) == 12_000_000_034 and message.header.frame_id == 'camera'
+    after = hand_from_msg(message.hands[0], HAND21)
+    np.testing.assert_array_equal(after.joints, before.joints)
+    np.testing.assert_array_equal(after.confidence, before.confidence)
+    assert (after.side, after.id, after.score, after.joint_names) == ('left', 'hand_1', 0.75, HAND21.joint_names)
+    assert after.cube.center == before.cube.center and after.cube.side == pytest.approx(0.3)
+
+
+def test_the_skeleton_message_names_every_joint_and_its_parent() -> None:
+    message = skeleton_to_msg(header(), HAND21, 'deep_prior', '1.0')
+    assert message.joint_names[message.parents[message.joint_names.index('index_pip')]] == 'index_mcp'
+    assert message.parents[message.joint_names.index('wrist')] == -1
+    assert (message.model, message.model_version) == ('deep_prior', '1.0')
+
+
+def test_markers_are_joints_and_bones_in_the_colours_of_the_fingers() -> None:
+    estimate = hand()
+    array_ = HandMarkers(HAND21).update(hands_to_msg(header(), [estimate], HAND21), 0.5)
+    markers = {marker.ns: marker for marker in array_.markers}
+    joints, bones, cube = (markers[f'hand_1/{part}'] for part in ('joints', 'bones', 'cube'))
+    points = np.array([(p.x, p.y, p.z) for p in joints.points])
+    np.testing.assert_allclose(points, estimate.joints, atol=1e-6)
+    tip = HAND21.joint_names.index('pinky_tip')
+    color = joints.colors[tip]
+    np.testing.assert_allclose((color.r, color.g, color.b), np.array(FINGER_COLORS['pinky']) / 255, atol=1e-6)
+    ends = np.array([(p.x, p.y, p.z) for p in bones.points]).reshape(-1, 2, 3)
+    np.testing.assert_allclose(ends, estimate.joints[np.array(HAND21.bones)], atol=1e-6)
+    edges = np.array([(p.x, p.y, p.z) for p in cube.points]).reshape(-1, 2, 3)
+    assert len(edges) == 12
+    np.testing.assert_allclose(np.linalg.norm(edges[:, 0] - edges[:, 1], axis=1), 0.3, atol=1e-6)
+    np.testing.assert_allclose(edges.reshape(-1, 3).mean(0), (0.01, -0.02, 0.5), atol=1e-6)
+    for marker in markers.values():
+        assert marker.pose.orientation.w == 1 and marker.lifetime.nanosec == 500_000_000
+        assert len(marker.colors) in (0, len(marker.points)) and marker.header.frame_id == 'camera'
+
+
+def test_only_the_hand_that_is_gone_is_deleted() -> None:
+    markers = HandMarkers(HAND21)
+    markers.update(hands_to_msg(header(), [hand('a'), hand('b')], HAND21), 0.0)
+    second = markers.update(hands_to_msg(header(), [hand('b')], HAND21), 0.0).markers
+    assert {m.ns for m in second if m.action == Marker.DELETE} == {'a/joints', 'a/bones', 'a/cube'}
+    assert {m.ns for m in second if m.action == Marker.ADD} == {'b/joints', 'b/bones', 'b/cube'}
+    assert {m.ns for m in markers.clear(header()).markers} == {'b/joints', 'b/bones', 'b/cube'}
+    assert markers.clear(header()).markers == []
+
+
+def info(**fields) -> CameraInfo:
+    values = {'width': 640, 'height': 480, 'k': [500.0, 0, 320.0, 0, 510.0, 240.0, 0, 0, 1.0], **fields}
+    return CameraInfo(**{name: [float(x) for x in value] if name in 'kp' else value for name, value in values.items()})
+
+
+def test_rectified_images_take_p_and_raw_ones_k() -> None:
+    camera = Camera('/camera_info')
+    camera.update(info(p=[400.0, 0, 300.0, 0, 0, 405.0, 200.0, 0, 0, 0, 1.0, 0]))
+    assert camera.intrinsics(640, 480, Params()) == Intrinsics(400, 405, 300, 200, 640, 480)
+    assert camera.intrinsics(640, 480, Params(use_rectified=False)) == Intrinsics(500, 510, 320, 240, 640, 480)
+    given_ = Params(intrinsics_fx=1.0, intrinsics_fy=2.0, intrinsics_cx=3.0, intrinsics_cy=4.0)
+    assert camera.intrinsics(10, 20, given_) == Intrinsics(1, 2, 3, 4, 10, 20)
+
+
+def test_binning_and_region_of_interest() -> None:
+    camera = Camera('/camera_info')
+    camera.update(info(binning_x=2, binning_y=2,
+                       roi=RegionOfInterest(x_offset=100, y_offset=40, width=320, height=240)))
+    assert camera.intrinsics(160, 120, Params()) == Intrinsics(250, 255, 110, 100, 160, 120)
+
+
+numbers = st.floats(width=64)
+
+
+@settings(max_examples=500, deadline=None)
+@given(k=st.lists(numbers, min_size=9, max_size=9), p=st.lists(numbers, min_size=12, max_size=12),
+       size=st.tuples(*[st.integers(0, 2**32 - 1)] * 2), binning=st.tuples(*[st.integers(0, 2**32 - 1)] * 2),
+       roi=st.tuples(*[st.integers(0, 2**32 - 1)] * 4))
+def test_any_camera_info_is_usable_or_refused_with_its_topic(k, p, size, binning, roi) -> None:
+    camera = Camera('/depth/camera_info')
+    camera.update(info(k=k, p=p, width=size[0], height=size[1], binning_x=binning[0], binning_y=binning[1],
+                       roi=RegionOfInterest(x_offset=roi[0], y_offset=roi[1], width=roi[2], height=roi[3])))
+    try:
+        intrinsics = camera.intrinsics(640, 480, Params(camera_info_timeout=0.0))
+    except InputError as error:
+        assert '/depth/camera_info' in str(error)
+    else:
+        assert (intrinsics.width, intrinsics.height) == (640, 480) and intrinsics.fx > 0 and intrinsics.fy > 0
+
+
+def test_depth_that_cannot_hold_a_hand_is_explained() -> None:
+    far = np.full((48, 64), 4.0, np.float32)
+    assert 'depth_scale' in depth_problem(far, 0.1, 1.5)
+    assert 'no reading' in depth_problem(np.zeros((48, 64), np.float32), 0.1, 1.5)
+    far[:16, :16] = 0.5
+    assert depth_problem(far, 0.1, 1.5) == ''
+
+
+@pytest.mark.parametrize('wrong, words', [
+    ({'side': 'both'}, 'auto, left, right'), ({'device': 'gpu'}, 'cuda'), ({'min_depth': 2.0}, 'max_depth'),
+    ({'cube_size': 0.01}, '0.05'), ({'intrinsics_fx': 500.0}, 'intrinsics.fy'),
+    ({'transport': 'theora'}, 'compressedDepth')])
+def test_contradicting_parameters_are_refused(wrong: dict, words: str) -> None:
+    with pytest.raises(HandPoseError, match=words):
+        Params(**wrong)
+
+
+def test_the_parameter_file_has_every_parameter_with_its_default() -> None:
+    text = resource('config/estimator.yaml').read_text()
+    assert text == yaml_file(), 'write it again: hand_pose_ros.ros.params.yaml_file()'
+    values = yaml.safe_load(text)['/**']['ros__parameters']
+    assert values['depth_scale'] == 0.001 and values['autostart'] is True and values['intrinsics.fx'] == 0.0
+    assert all(f'`{name}`' in markdown_table() for name in values)
+
+
+def test_the_rviz_file_shows_the_markers() -> None:
+    manager = yaml.safe_load(resource('rviz/hand_pose.rviz').read_text())['Visualization Manager']
+    topics = [display['Topic']['Value'] for display in manager['Displays'] if 'Topic' in display]
+    assert topics == ['/hand/markers']
+
+
+def test_the_launch_file_starts_the_node_with_its_parameter_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With stand-ins for launch, which has no wheels: what the file passes to it is what is tested."""
+    import sys
+    from types import ModuleType
+
+    calls: list[tuple[str, tuple, dict]] = []
+
+    def stand_in(module: str, *names: str) -> None:
+        made = ModuleType(module)
+        for name in names:
+            def call(*args, _name=name, **kwargs):
+                calls.append((_name, args, kwargs))
+                return _name, args
+            setattr(made, name, call)
+        monkeypatch.setitem(sys.modules, module, made)
+
+    stand_in('launch', 'LaunchDescription')
+    stand_in('launch.actions', 'DeclareLaunchArgument')
+    stand_in('launch.conditions', 'IfCondition')
+    stand_in('launch.substitutions', 'LaunchConfiguration')
+    stand_in('launch_ros', 'actions')
+    stand_in('launch_ros.actions', 'Node')
+    path = resource('launch/estimator.launch.py')
+    spec = importlib.util.spec_from_file_location('estimator_launch', path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    module.generate_launch_description()
+
+    declared = {args[0]: kwargs for name, args, kwargs in calls if name == 'DeclareLaunchArgument'}
+    used = {args[0] for name, args, _ in calls if name == 'LaunchConfiguration'}
+    assert used == set(declared) and all(kwargs['description'] for kwargs in declared.values())
+    node, rviz = (kwargs for name, _, kwargs in calls if name == 'Node')
+    assert (node['package'], node['executable'], node['name']) == ('hand_pose_ros', 'estimator', 'estimator')
+    assert resource('config/estimator.yaml').samefile(declared['params_file']['default_value'])
+    assert resource('rviz/hand_pose.rviz').samefile(rviz['arguments'][1])
+
+
+def test_messages_hold_plain_arrays() -> None:
+    """Slow lists would pass unnoticed: 21 confidences travel as one block."""
+    assert isinstance(hands_to_msg(header(), [hand()], HAND21).hands[0].confidence, array)

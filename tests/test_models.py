@@ -58,7 +58,7 @@ def test_layer_shapes_of_deep_and_multi_scale():
     def shapes(module: nn.Module, patch: torch.Tensor) -> list[tuple[int, ...]]:
         found: list[tuple[int, ...]] = []
         hooks = [m.register_forward_hook(lambda _, __, out: found.append(tuple(out.shape[1:])))
-                 for m in module.modules() if isinstance(m, nn.ReLU) or isinstance(m, nn.Linear)]
+                 for m in module.modules() if isinstance(m, (nn.ReLU, nn.Linear))]
         module(patch)
         for hook in hooks:
             hook.remove()
@@ -132,7 +132,7 @@ def test_the_prior_equals_a_singular_value_decomposition():
 
 
 def test_mistakes_are_named():
-    with pytest.raises(HandPoseError, match="choose one of .*deep"):
+    with pytest.raises(HandPoseError, match=r"choose one of .*deep"):
         build("deeper")
     with pytest.raises(HandPoseError, match="does not take depth: it takes joints"):
         build("deep", depth=3)
@@ -199,18 +199,17 @@ def test_one_joint_equals_plain_convolutions_over_a_sampled_window(architecture)
     patch = hand_patches(1)
     estimate = torch.tensor([[[0.11, -0.23, 0.05]]]).repeat(1, 21, 1)
 
-    reach = refiner.window / 128
     marked = torch.where(patch < 1, patch, torch.full_like(patch, 1e4))
-    depth = ((marked - estimate[0, joint, 2]) / reach).clamp(-1, 1)
-    line = (torch.arange(refiner.window) + 0.5) / refiner.window * 2 - 1
-    grid = torch.stack([line.expand(refiner.window, -1) * reach + estimate[0, joint, 0],
-                        line[:, None].expand(-1, refiner.window) * reach + estimate[0, joint, 1]], dim=-1)
-    window = F.grid_sample(depth, grid[None], mode="bilinear", padding_mode="border", align_corners=False)
-
     features = []
     for view, branch in zip(refiner.views, refiner.branches, strict=True):
-        border = (refiner.window - view) // 2
-        x = window[..., border:border + view, border:border + view]
+        reach = view.width / 128
+        nearest = -F.max_pool2d(-marked, view.shrink)
+        depth = ((nearest - estimate[0, joint, 2]) / reach).clamp(-1, 1)
+        cells = view.width // view.shrink
+        line = ((torch.arange(cells) + 0.5) / cells * 2 - 1) * reach
+        grid = torch.stack([line.expand(cells, -1) + estimate[0, joint, 0],
+                            line[:, None].expand(-1, cells) + estimate[0, joint, 1]], dim=-1)
+        x = F.grid_sample(depth, grid[None], mode="bilinear", padding_mode="border", align_corners=False)
         for module in branch:
             if isinstance(module, nn.Conv2d):
                 count = module.out_channels // 21
@@ -223,7 +222,7 @@ def test_one_joint_equals_plain_convolutions_over_a_sampled_window(architecture)
     for i, (weight, bias) in enumerate(zip(refiner.weights, refiner.biases, strict=True)):
         x = x @ weight[joint] + bias[joint, 0]
         x = F.relu(x) if i < len(refiner.weights) - 1 else x
-    expected = estimate[0, joint] + x * reach
+    expected = estimate[0, joint] + x / 2  # offsets are in units of the largest cube, half of the hand's
     torch.testing.assert_close(refiner(patch, estimate, iterations=1)[0, joint], expected, atol=1e-5, rtol=0)
 
 

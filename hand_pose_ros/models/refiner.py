@@ -28,25 +28,36 @@ class Layer(NamedTuple):
     pool: int
 
 
+class View(NamedTuple):
+    """What one branch looks at: a cube centred on the joint, and its layers."""
+
+    width: int
+    """Of the cube, in pixels of the patch."""
+    shrink: int
+    """The view is taken from the patch pooled by this factor (the nearest reading of a square stays)."""
+    layers: tuple[Layer, ...]
+
+
 class Refiner(nn.Module):
     """Refines J joints with J small networks of one architecture.
 
     Args:
         joints: J.
-        views: for every branch the width of its view in pixels of the patch, and its layers.
+        views: one for every branch.
         hidden: widths of the fully connected layers behind the branches.
         dropout: after each of them, while training.
     """
 
-    def __init__(self, joints: int, views: dict[int, tuple[Layer, ...]], hidden: tuple[int, ...],
+    def __init__(self, joints: int, views: tuple[View, ...], hidden: tuple[int, ...],
                  dropout: float) -> None:
         super().__init__()
-        self.joints, self.views, self.window = joints, views, max(views)
-        self.branches = nn.ModuleList(nn.Sequential(*_branch(joints, layers)) for layers in views.values())
+        self.joints, self.views = joints, views
+        self.branches = nn.ModuleList(nn.Sequential(*_branch(joints, view.layers)) for view in views)
         features = 0
         for view, branch in zip(views, self.branches, strict=True):
+            cells = view.width // view.shrink
             with torch.no_grad():
-                features += branch(torch.zeros(1, joints, view, view)).numel() // joints
+                features += branch(torch.zeros(1, joints, cells, cells)).numel() // joints
         widths = (features, *hidden, 3)
         self.weights = nn.ParameterList(torch.empty(joints, i, o) for i, o in pairwise(widths))
         self.biases = nn.ParameterList(torch.zeros(joints, 1, o) for o in widths[1:])
@@ -59,26 +70,24 @@ class Refiner(nn.Module):
 
         The gradient reaches the weights through the last iteration only: where to look is taken as given.
         """
-        padded = _pad(patch, self.window)
+        images = [_marked(patch, view) for view in self.views]
         for _ in range(iterations):
             joints = joints.detach()
-            joints = joints + self.offsets(_cut(padded, joints, self.window))
+            joints = joints + self.offsets([_cut(image, joints, view) for image, view in
+                                            zip(images, self.views, strict=True)])
         return joints
 
-    def offsets(self, windows: Tensor) -> Tensor:
-        """Views centred on the estimates (B, J, window, window) -> truth minus estimate (B, J, 3) in cube units."""
-        features = []
-        for view, branch in zip(self.views, self.branches, strict=True):
-            border = (self.window - view) // 2
-            inner = windows[..., border:border + view, border:border + view]
-            features.append(branch(inner).unflatten(1, (self.joints, -1)).flatten(2))
+    def offsets(self, windows: list[Tensor]) -> Tensor:
+        """For every view (B, J, N, N), centred on the estimates -> truth minus estimate (B, J, 3) in cube units."""
+        features = [branch(window).unflatten(1, (self.joints, -1)).flatten(2)
+                    for branch, window in zip(self.branches, windows, strict=True)]
         x = torch.cat(features, dim=2).transpose(0, 1)  # (J, B, F): one matrix product per joint
         last = len(self.weights) - 1
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             x = torch.baddbmm(bias, x, weight)
             if i < last:
                 x = self.dropout(F.relu(x))
-        return x.transpose(0, 1) * (self.window / PATCH_SIZE)
+        return x.transpose(0, 1) * max(map(_reach, self.views))
 
     def for_joint(self, joint: int) -> Refiner:
         """The network of one joint alone, a copy: what the grouped computation is compared with."""
@@ -92,7 +101,8 @@ class StdRef(Refiner):
     """The convolutions of the Deep network on one view per joint, 64 pixels (half the cube) wide."""
 
     def __init__(self, joints: int = 21, hidden: tuple[int, ...] = (96, 96), dropout: float = 0.3) -> None:
-        super().__init__(joints, {64: (Layer(8, 5, 2), Layer(8, 5, 2), Layer(8, 3, 1))}, hidden, dropout)
+        view = View(64, 1, (Layer(8, 5, 2), Layer(8, 5, 2), Layer(8, 3, 1)))
+        super().__init__(joints, (view,), hidden, dropout)
 
 
 class ORRef(Refiner):
@@ -102,11 +112,11 @@ class ORRef(Refiner):
     """
 
     def __init__(self, joints: int = 21, hidden: tuple[int, ...] = (96, 96), dropout: float = 0.3) -> None:
-        super().__init__(joints, {
-            64: (Layer(8, 5, 4), Layer(8, 3, 2)),
-            32: (Layer(8, 5, 2), Layer(8, 3, 2)),
-            16: (Layer(8, 5, 1), Layer(8, 3, 1)),
-        }, hidden, dropout)
+        super().__init__(joints, (
+            View(64, 2, (Layer(8, 5, 2), Layer(8, 3, 2))),
+            View(32, 1, (Layer(8, 5, 2), Layer(8, 3, 2))),
+            View(16, 1, (Layer(8, 5, 1), Layer(8, 3, 1))),
+        ), hidden, dropout)
 
 
 def _branch(joints: int, layers: tuple[Layer, ...]) -> list[nn.Module]:
@@ -125,30 +135,38 @@ FAR = 100.0
 """Stands for the background, so that it stays behind the back face whatever depth a window is centred on."""
 
 
-def _pad(patch: Tensor, border: int) -> Tensor:
-    """(B, 1, 128, 128) -> (B, W, W), W = 128 + 2 border + 1, with the background, there and around it, at FAR."""
+def _reach(view: View) -> float:
+    """From the centre of a view to its faces, in cube units."""
+    return view.width / PATCH_SIZE
+
+
+def _marked(patch: Tensor, view: View) -> Tensor:
+    """(B, 1, 128, 128) -> (B, W, W), pooled for a view, with the background, there and around it, at FAR."""
     marked = torch.where(patch < 1, patch, torch.full_like(patch, FAR))
+    if view.shrink > 1:
+        marked = -F.max_pool2d(-marked, view.shrink)
+    border = view.width // view.shrink
     return F.pad(marked[:, 0], (border, border + 1) * 2, value=FAR)
 
 
-def _cut(padded: Tensor, joints: Tensor, window: int) -> Tensor:
-    """Cubes around the joints (B, J, 3), as views (B, J, window, window) in [-1, 1] like a patch.
+def _cut(image: Tensor, joints: Tensor, view: View) -> Tensor:
+    """The cubes of a view around the joints (B, J, 3), as (B, J, N, N) in [-1, 1] like a patch.
 
-    Depth is taken relative to the joint and clipped to the cube of the window, and then shifted by the fraction of a
-    pixel (bilinear), so that the views, and with them the result, follow the estimate without jumps.
+    Depth is taken relative to the joint and clipped to the cube, and then shifted by the fraction of a pixel
+    (bilinear), so that the views, and with them the result, follow the estimate without jumps.
     """
-    width = PATCH_SIZE + 2 * window + 1
-    reach = window / PATCH_SIZE
+    size, cells, reach = PATCH_SIZE // view.shrink, view.width // view.shrink, _reach(view)
+    stride = size + 2 * cells + 1
     joints = joints.float()  # a half has not the precision for positions
     # An estimate further out than the clamp sees nothing but background, wherever it is.
-    corner = (joints[..., :2].clamp(-1 - reach, 1 + reach) + 1) * (PATCH_SIZE / 2) - 0.5 + window / 2 + 0.5
+    corner = (joints[..., :2].clamp(-1 - reach, 1 + reach) + 1) * (size / 2) + cells / 2
     whole = corner.floor()
-    x, y = (corner - whole).to(padded.dtype)[..., None, None, :].unbind(-1)  # (B, J, 1, 1) each
+    x, y = (corner - whole).to(image.dtype)[..., None, None, :].unbind(-1)  # (B, J, 1, 1) each
     column, row = whole.int().unbind(-1)
-    hand = torch.arange(padded.shape[0], device=padded.device, dtype=torch.int32)[:, None]
-    line = torch.arange(window + 1, device=padded.device, dtype=torch.int32)
-    first = (hand * width + row) * width + column  # (B, J), positions in the flat batch
-    pixels = padded.flatten()[first[..., None, None] + (line[:, None] * width + line)]  # (B, J, 65, 65)
+    hand = torch.arange(image.shape[0], device=image.device, dtype=torch.int32)[:, None]
+    line = torch.arange(cells + 1, device=image.device, dtype=torch.int32)
+    first = (hand * stride + row) * stride + column  # (B, J), positions in the flat batch
+    pixels = image.flatten()[first[..., None, None] + (line[:, None] * stride + line)]  # (B, J, N + 1, N + 1)
     depth = ((pixels - joints[..., 2, None, None].to(pixels.dtype)) * (1 / reach)).clamp(-1, 1)
     depth = depth[..., :-1, :] + (depth[..., 1:, :] - depth[..., :-1, :]) * y
     return depth[..., :-1] + (depth[..., 1:] - depth[..., :-1]) * x

@@ -1,0 +1,283 @@
+"""`hand-pose bench`: how fast this machine runs networks, refinement, every stage and whole frames."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+    from hand_pose_ros.estimator import HandPoseEstimator
+    from hand_pose_ros.runtime.engine import Pipeline
+
+_EXAMPLES = """examples:
+  hand-pose bench
+  hand-pose bench --json speed.json --threads 1
+  hand-pose bench --model my.safetensors --quick
+
+Networks have random weights unless --model gives others: speed does not depend on them. All rows of a group run in
+turn, round by round, so that whatever else the machine does meets them alike. floor is the larger of two times, both
+measured in the same run: the operations at the rate of a large matrix product, and the weights read once by a
+matrix-vector product.
+"""
+_WARM_UP = 5
+_CALLS = 10
+"""Calls of one row before it is the turn of the next."""
+
+
+def add_parser(subparsers: Any) -> None:
+    """Declare the verb."""
+    parser = subparsers.add_parser(
+        'bench', help='measure speed on this machine', description=__doc__.split(': ')[1], epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--json', type=Path, metavar='FILE', help='write the rows there too')
+    parser.add_argument('--model', help='whole frames with these weights, by name or path (random ones)')
+    parser.add_argument('--threads', type=int, metavar='N', help='threads for the networks (chosen by the cores)')
+    parser.add_argument('--rounds', type=int, default=20, metavar='N',
+                        help=f'rounds of {_CALLS} calls for each row (%(default)s)')
+    parser.add_argument('--quick', action='store_true',
+                        help='one round, and without torch.compile, which takes a minute')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, print the table, write the JSON."""
+    import onnxruntime
+    import torch
+
+    from hand_pose_ros import __version__
+    from hand_pose_ros.evaluation.results import write_atomically
+    from hand_pose_ros.runtime import default_threads
+
+    threads = args.threads or default_threads()
+    torch.set_num_threads(threads)
+    torch.manual_seed(0)
+    rounds = 1 if args.quick else args.rounds
+    rows: dict[str, dict[str, float]] = {}
+    with torch.inference_mode():
+        for architecture in ('deep_prior', 'hand_dense'):
+            rows |= _network_rows(architecture, threads, rounds, compiled=not args.quick)
+        rows |= _refiner_rows('or_ref', threads, rounds)
+        rows |= _frame_rows(args.model, threads, rounds)
+    machine = {
+        'cpu': _cpu_name(), 'cores': os.cpu_count(), 'threads': threads, 'python': platform.python_version(),
+        'torch': torch.__version__, 'onnxruntime': onnxruntime.__version__, 'hand_pose_ros': __version__}
+    print(', '.join(f'{key} {value}' for key, value in machine.items()))
+    print(_table(rows))
+    if args.json:
+        result = json.dumps({'machine': machine, 'rows': rows}, indent=2).encode()
+        write_atomically(args.json, lambda file: file.write(result))
+    return 0
+
+
+def measure(calls: dict[str, Callable[[], Any]], rounds: int) -> dict[str, dict[str, float]]:
+    """Time each call `rounds` x 10 times, in turn: {name: {p50_ms, p99_ms, min_ms, calls}}."""
+    import numpy as np
+
+    for call in calls.values():
+        for _ in range(_WARM_UP):
+            call()
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(rounds):
+        for name, call in calls.items():
+            for _ in range(_CALLS):
+                start = time.perf_counter()
+                call()
+                times[name].append(time.perf_counter() - start)
+    return {name: summary(np.array(seconds)) for name, seconds in times.items()}
+
+
+def summary(seconds: Any) -> dict[str, float]:
+    """Times in seconds -> one row."""
+    import numpy as np
+
+    p50, p99 = np.percentile(seconds, [50, 99]) * 1e3
+    return {'p50_ms': float(p50), 'p99_ms': float(p99), 'min_ms': float(np.min(seconds) * 1e3), 'calls': len(seconds)}
+
+
+def _network_rows(architecture: str, threads: int, rounds: int, compiled: bool) -> dict[str, dict[str, float]]:
+    """One network, one patch, over every way to run it."""
+    import numpy as np
+    import torch
+
+    from hand_pose_ros.models import build
+    from hand_pose_ros.runtime import make_engine
+    from hand_pose_ros.runtime.engine import Pipeline, TorchEngine
+
+    pipeline = Pipeline(build(architecture)).eval()
+    patch = _patches(1)
+    array = patch.numpy()
+    engine = make_engine(pipeline.network, 'cpu', threads)
+    eight = np.repeat(array, 8, axis=0)
+    plain = TorchEngine(pipeline)
+    calls: dict[str, Callable[[], Any]] = {
+        'engine': lambda: engine.run(array),
+        'pytorch': lambda: plain.run(array),
+        **_references(pipeline, array, threads),
+    }
+    if compiled:
+        fast = torch.compile(pipeline)
+        try:
+            fast(patch)
+            calls['torch.compile'] = lambda: fast(patch)
+        except Exception as error:  # whatever a compiler that is missing or too old comes up with
+            print(f'torch.compile does not work here: {str(error).splitlines()[0]}')
+    calls['engine, 8 hands'] = lambda: engine.run(eight)
+    rows = {**measure(calls, rounds), 'floor': _floor(pipeline, (patch,), threads)}
+    return {f'network {architecture}: {name}': row for name, row in rows.items()}
+
+
+def _references(pipeline: Pipeline, array: Any, threads: int) -> dict[str, Callable[[], Any]]:
+    """The same graph in ONNX Runtime with its own defaults, and in OpenVINO if it is installed."""
+    import onnxruntime
+
+    from hand_pose_ros.runtime.onnx_engine import export
+
+    model = export(pipeline)
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.log_severity_level = 3
+    session = onnxruntime.InferenceSession(model, options, providers=['CPUExecutionProvider'])
+    calls: dict[str, Callable[[], Any]] = {'onnxruntime, bare, spinning': lambda: session.run(None, {'patches': array})}
+    try:
+        import openvino
+    except ImportError:
+        return calls
+    core = openvino.Core()
+    compiled = core.compile_model(core.read_model(model, b''), 'CPU', {
+        'INFERENCE_NUM_THREADS': threads, 'PERFORMANCE_HINT': 'LATENCY'})
+    calls['openvino'] = lambda: compiled(array)
+    return calls
+
+
+def _refiner_rows(architecture: str, threads: int, rounds: int) -> dict[str, dict[str, float]]:
+    """21 joints, 2 iterations, without the network that gives the first estimate."""
+    import torch
+    from torch import nn
+
+    from hand_pose_ros.models import build
+    from hand_pose_ros.runtime import make_engine
+    from hand_pose_ros.runtime.engine import Pipeline, TorchEngine
+
+    class Still(nn.Module):
+        """Estimates that cost nothing."""
+
+        def forward(self, patches: Tensor) -> Tensor:
+            return patches[:, 0, ::6, :3][:, :21] * 0.3
+
+    refiner = build(architecture).eval()
+    alone = [refiner.for_joint(joint) for joint in range(21)]  # type: ignore[operator]
+    patch = _patches(1)
+    array, joints = patch.numpy(), Still()(patch)
+    plain, engine = TorchEngine(Pipeline(Still(), refiner)), make_engine(Still(), 'cpu', threads, refiner)
+
+    def joint_by_joint() -> Tensor:
+        return torch.cat([network(patch, joints[:, j:j + 1]) for j, network in enumerate(alone)], dim=1)
+
+    rows = measure({'engine': lambda: engine.run(array), 'pytorch, all joints at once': lambda: plain.run(array),
+                    'pytorch, joint by joint': joint_by_joint}, rounds)
+    rows['floor'] = _floor(refiner, (patch, joints), threads, reads=2)
+    return {f'refine {architecture} x2: {name}': row for name, row in rows.items()}
+
+
+def _frame_rows(model: str | None, threads: int, rounds: int) -> dict[str, dict[str, float]]:
+    """From a VGA image of 16-bit integers to joints in metres, in all and by stage; a hand that is tracked."""
+    import numpy as np
+
+    from hand_pose_ros.depth import to_metres, to_units
+    from hand_pose_ros.estimator import HandPoseEstimator
+    from hand_pose_ros.models import build
+    from hand_pose_ros.runtime import make_engine
+    from hand_pose_ros.skeleton import HAND21
+
+    depth, intrinsics = _vga_frame()
+    units = to_units(depth)
+
+    def estimator(architecture: str, refiner: str | None = None, **options: Any) -> HandPoseEstimator:
+        second = build(refiner) if refiner else None
+        engine = make_engine(build(architecture), 'cpu', threads, second)
+        return HandPoseEstimator(engine, HAND21, min_score=-1, side='right', **options)
+
+    estimators = {
+        'deep_prior': estimator('deep_prior'), 'deep_prior, searching': estimator('deep_prior', tracking=False),
+        'deep_prior + or_ref x2': estimator('deep_prior', 'or_ref'), 'hand_dense': estimator('hand_dense')}
+    if model:
+        estimators[model] = HandPoseEstimator.from_pretrained(model, device='cpu', num_threads=threads)
+    stages: dict[str, list[float]] = {}
+
+    def frame(name: str) -> Callable[[], None]:
+        def call() -> None:
+            start = time.perf_counter()
+            metres = to_metres(units)
+            decoded = time.perf_counter() - start
+            estimators[name](metres, intrinsics)
+            for stage, seconds in {'decode': decoded, **estimators[name].timings}.items():
+                stages.setdefault(f'stage {name}: {stage}', []).append(seconds)
+        return call
+
+    rows = measure({f'frame {name}': frame(name) for name in estimators}, rounds)
+    for name, seconds in stages.items():
+        rows[name] = summary(np.array(seconds[_WARM_UP:]))
+    return rows
+
+
+def _floor(module: nn.Module, inputs: tuple[Tensor, ...], threads: int, reads: int = 1) -> dict[str, float]:
+    """The least time that the operations and the weights of a module need here: a row, with both parts."""
+    import torch
+    from torch.utils.flop_counter import FlopCounterMode
+
+    with FlopCounterMode(display=False) as counter:
+        module(*inputs)
+    operations, weights = counter.get_total_flops(), sum(p.numel() for p in module.parameters())
+    side = 1024
+    square, matrix = torch.rand(side, side), torch.rand(-(-weights // side), side)
+    times = measure({'multiply': lambda: square @ square, 'read': lambda: matrix @ square[0]}, rounds=3)
+    compute = times['multiply']['min_ms'] * operations / (2 * side ** 3)
+    memory = times['read']['min_ms'] * reads
+    floor = max(compute, memory)
+    return {'p50_ms': floor, 'p99_ms': floor, 'min_ms': floor, 'compute_ms': compute, 'memory_ms': memory,
+            'operations': operations, 'weights': weights}
+
+
+def _patches(count: int) -> Tensor:
+    """Half hand, half background, as patches are."""
+    import torch
+
+    patches = torch.rand(count, 1, 128, 128) - 0.5
+    patches[..., 64:] = 1
+    return patches
+
+
+def _vga_frame() -> tuple[Any, Any]:
+    """A rendered hand before a room, 640 x 480, in metres, and the intrinsics."""
+    from itertools import count
+
+    from hand_pose_ros.detection import detect
+    from hand_pose_ros.synthetic.generator import SyntheticHands
+
+    hands = SyntheticHands('train')
+    frames = (hands.full_frame(index) for index in count())
+    return next((depth, intrinsics) for depth, intrinsics, _, side in frames
+                if depth.shape == (480, 640) and side != 'none' and detect(depth, intrinsics))
+
+
+def _cpu_name() -> str:
+    try:
+        lines = Path('/proc/cpuinfo').read_text().splitlines()
+        return next(line.split(': ')[1] for line in lines if line.startswith('model name'))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def _table(rows: dict[str, dict[str, float]]) -> str:
+    width = max(map(len, rows))
+    lines = [f'{"":{width}}  {"p50 ms":>8} {"p99 ms":>8} {"best ms":>8}']
+    lines += [f'{name:{width}}  {row["p50_ms"]:8.3f} {row["p99_ms"]:8.3f} {row["min_ms"]:8.3f}'
+              for name, row in rows.items()]
+    return '\n'.join(lines)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hand_pose_ros.cli import main
-from hand_pose_ros.errors import InputError
+from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.evaluation import tompson
 from hand_pose_ros.evaluation.published import DATASETS, load_published, load_result, read_text
 from hand_pose_ros.evaluation.results import Result
@@ -152,7 +152,7 @@ def test_wrong_counts_joints_and_units_are_refused(tmp_path, uvd, capsys):
 
 
 def test_nyu_frame_1_is_decoded_and_lies_before_its_joints(shared_data):
-    depth = tompson.read_nyu_depth(shared_data / 'frames' / 'nyu' / 'depth_1_0000001.png')
+    depth = tompson.read_nyu_depths(shared_data / 'frames' / 'nyu', [0])[0]
     labels = read_text(shared_data / 'published' / 'nyu' / 'groundtruth.txt.gz', NYU.skeleton)
     assert depth.shape == (480, 640) and depth[depth > 0].min() == pytest.approx(0.731) and depth.max() < 2
     u, v, d = labels.uvd[0].T
@@ -192,9 +192,9 @@ def test_nyu_depth_is_written_in_green_and_blue(tmp_path):
     cv2.imwrite(str(tmp_path / 'depth_1_0000002.png'), picture)
     depths = tompson.read_nyu_depths(tmp_path, [0, 1])
     assert list(depths) == [1] and depths[1] == pytest.approx(np.array([[0.801, 0], [0, 0]]))
-    cv2.imwrite(str(tmp_path / 'grey.png'), np.ones((4, 4), np.uint16))
-    with pytest.raises(InputError, match='not a depth frame of NYU'):
-        tompson.read_nyu_depth(tmp_path / 'grey.png')
+    cv2.imwrite(str(tmp_path / 'depth_1_0000003.png'), np.ones((4, 4), np.uint16))
+    with pytest.raises(HandPoseError, match=r'depth_1_0000003\.png is not a depth image'):
+        tompson.read_nyu_depths(tmp_path, [2])
 
 
 def test_results_are_kept_with_all_that_belongs_to_them(tmp_path):

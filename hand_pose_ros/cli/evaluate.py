@@ -14,7 +14,7 @@ import numpy as np
 from tqdm import tqdm
 
 from hand_pose_ros.errors import HandPoseError, InputError
-from hand_pose_ros.evaluation import published, tompson
+from hand_pose_ros.evaluation import published
 from hand_pose_ros.evaluation.results import Result, write_json
 from hand_pose_ros.evaluation.tables import ACCURACY_COLUMNS, accuracy_rows, number, text_table
 
@@ -91,6 +91,9 @@ def _run_text(args: argparse.Namespace) -> int:
     if args.intrinsics:
         fx, fy, cx, cy = args.intrinsics
         dataset = replace(dataset, intrinsics=replace(dataset.intrinsics, fx=fx, fy=fy, cx=cx, cy=cy))
+    if args.depth_folder:
+        from hand_pose_ros.evaluation import tompson  # and torch, for which text alone need not wait
+
     if Path(args.predictions).suffix == '.npz':
         if not args.depth_folder:
             args.error('2D joints need --depth-folder')

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.io import loadmat
 
 from hand_pose_ros.datasets.base import DatasetError, LabelledFrame, RecordedDataset, fingerprint, read_depth, require
@@ -21,6 +22,20 @@ FIRST_SUBJECT = 2440
 """Test frames of the first subject; the rest shows a smaller hand."""
 HELD_OUT = 0.05
 """Share of the training frames, the last ones, that validate: the training set has a single subject."""
+
+
+def read_nyu_depth(path: Path) -> NDArray[np.float32]:
+    """Depth (H, W) in metres of a frame, 0 = no reading.
+
+    It is packed into the colours of a PNG, green for the high byte of the millimetres, blue for the low; 2001 and
+    above is no reading.
+
+    Raises:
+        DatasetError: the file is missing, damaged or of another kind.
+    """
+    image = read_depth(path, 'NYU', channels=3).astype(np.uint16)
+    millimetres = image[..., 1] << 8 | image[..., 0]
+    return np.where(millimetres < 2001, millimetres, 0).astype(np.float32) / np.float32(1000)
 
 
 class NYU(RecordedDataset):
@@ -57,11 +72,8 @@ class NYU(RecordedDataset):
         return self._folder / f'depth_1_{frame + 1:07d}.png'
 
     def frame(self, index: int) -> LabelledFrame:
-        """Depth is packed in two channels, green for the high byte, blue for the low; 2001 and above is no reading."""
         frame = self._frames[index]
-        image = read_depth(self._path(frame), 'NYU', channels=3).astype(np.uint16)
-        millimetres = image[..., 1] << 8 | image[..., 0]
-        depth = np.where(millimetres < 2001, millimetres, 0).astype(np.float32) / 1000
+        depth = read_nyu_depth(self._path(frame))
         joints = self._joints[frame]
         smaller = self._folder.name == 'test' and frame >= FIRST_SUBJECT
         # The factor is the original authors' knowledge of the subject's hand: say so with every number that uses it.

@@ -19,7 +19,7 @@ from hand_pose_ros.evaluation.results import Result, write_atomically
 # Okabe & Ito (2008): told apart with any colour vision, and in grey by their order of lightness.
 COLORS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9', '#000000', '#B8A800')
 
-_STYLE: dict[Any, Any] = {
+STYLE: dict[Any, Any] = {
     'font.family': 'DejaVu Sans', 'font.size': 10, 'axes.titlesize': 11, 'axes.titleweight': 'bold',
     'axes.titlelocation': 'left', 'axes.spines.top': False, 'axes.spines.right': False, 'axes.grid': True,
     'grid.color': '#e4e7eb', 'grid.linewidth': 0.8, 'axes.axisbelow': True, 'axes.edgecolor': '#8a94a0',
@@ -28,7 +28,7 @@ _STYLE: dict[Any, Any] = {
 }
 
 
-@matplotlib.rc_context(_STYLE)
+@matplotlib.rc_context(STYLE)
 def curves(results: Sequence[Result]) -> Figure:
     """Fraction of frames whose every joint, and of joints that themselves, are within a distance."""
     distances = np.linspace(0, 80, 321)
@@ -47,7 +47,7 @@ def curves(results: Sequence[Result]) -> Figure:
     return figure
 
 
-@matplotlib.rc_context(_STYLE)
+@matplotlib.rc_context(STYLE)
 def joint_bars(results: Sequence[Result]) -> Figure:
     """Mean error of each joint, results side by side; they must have the same skeleton."""
     skeleton = results[0].skeleton
@@ -66,7 +66,7 @@ def joint_bars(results: Sequence[Result]) -> Figure:
     return figure
 
 
-@matplotlib.rc_context(_STYLE)
+@matplotlib.rc_context(STYLE)
 def over_time(result: Result) -> Figure:
     """Mean and worst error of each frame, missed frames as marks at the foot; parts are separated."""
     errors = result.errors_mm
@@ -90,7 +90,7 @@ def over_time(result: Result) -> Figure:
     return figure
 
 
-@matplotlib.rc_context(_STYLE)
+@matplotlib.rc_context(STYLE)
 def latency(result: Result) -> Figure:
     """Milliseconds of each stage in each frame, stacked: what a frame costs, and where."""
     at, label = _time_axis(result)
@@ -107,7 +107,7 @@ def latency(result: Result) -> Figure:
 def to_bytes(figure: Figure, form: str) -> bytes:
     """The figure as the content of a 'png' or 'svg' file."""
     buffer = BytesIO()
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure.savefig(buffer, format=form, dpi=150, metadata={'Date': None} if form == 'svg' else None)
     return buffer.getvalue()
 

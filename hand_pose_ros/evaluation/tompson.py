@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hand_pose_ros.datasets.nyu import PALM, read_nyu_depth
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.evaluation.published import Dataset, read_text
 from hand_pose_ros.evaluation.results import Result
@@ -17,31 +17,13 @@ from hand_pose_ros.geometry import Intrinsics
 
 Protocol = Literal['paper', 'code']
 
-PALM = 13
-"""Row of nyu14 whose labelled depth is the middle of the cube."""
 SIDES_M = {'subject 1': 0.300, 'subject 2': 0.249}
 """Cube sides of DeepPrior: the second hand is 0.83 times as large."""
 CODE_REACH_M = 0.150
-_NO_DATA_MM = 2001
-
-
-def read_nyu_depth(path: str | Path) -> NDArray[np.float32]:
-    """Depth (H, W) in metres of an NYU frame, 0 = no reading: an 8-bit colour PNG with mm = 256 green + blue.
-
-    Raises:
-        InputError: the file cannot be read or is of another form.
-    """
-    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if picture is None or picture.dtype != np.uint8 or picture.ndim != 3 or picture[..., 2].any():
-        raise InputError(f'{path}: not a depth frame of NYU (an 8-bit colour PNG whose red is 0): '
-                         'give the folder of depth_1_0000001.png and so on')
-    millimetres = picture[..., 1].astype(np.float32) * 256 + picture[..., 0]
-    millimetres[millimetres == _NO_DATA_MM] = 0
-    return millimetres / np.float32(1000)
 
 
 def read_nyu_depths(folder: str | Path, rows: Sequence[int]) -> dict[int, NDArray[np.float32]]:
-    """The depth images (H, W) in metres of rows of the test set that are in the folder, as depth_1_%07d.png from 1."""
+    """Depth (H, W) in metres of those rows of the test set that a folder has, as depth_1_%07d.png, from 1 on."""
     paths = {row: Path(folder) / f'depth_1_{row + 1:07d}.png' for row in rows}
     return {row: read_nyu_depth(path) for row, path in paths.items() if path.is_file()}
 

@@ -42,7 +42,7 @@ def trained(architecture: str) -> torch.nn.Module:
     network.eval()
     scale = network(patches).abs().max()
     if architecture == "hand_dense":
-        network.maps.weight.mul_(20)
+        network.maps.weight.mul_(2)
     else:
         for layer in (network.head.reconstruction or network.head.output,):
             layer.weight.mul_(0.7 / scale)
@@ -67,7 +67,7 @@ def test_the_cpu_engine_equals_plain_pytorch(architecture):
         answer = engine.run(patches)
         assert answer.shape == (count, 21, 3)
         assert answer.dtype == np.float32
-        assert np.abs(expected).max() > 0.05
+        assert 0.05 < np.abs(expected).max() < 2
         assert np.abs(answer - expected).max() * MM_PER_UNIT <= 0.05
 
 

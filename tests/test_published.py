@@ -100,6 +100,7 @@ def test_nan_and_zero_joints_are_missing(tmp_path, uvd):
     broken[0, 3], broken[1, 0, 0], broken[2] = 0, np.nan, np.nan
     result = load_published(write_uvd(tmp_path / 'p.txt', broken), write_uvd(tmp_path / 'g.txt', uvd), NYU)
     summary = result.summary()
+    assert '16 joints are missing in p.txt' in result.notes[0]
     assert (summary['missed_frames'], summary['missed_joints'], summary['frames']) == (1, 16, 5)
     assert summary['mean_mm'] == pytest.approx(0, abs=1e-6), 'what was predicted is right'
     assert summary['within_mm']['80'] == pytest.approx(2 / 5) and summary['detection_rate'] == pytest.approx(4 / 5)

@@ -100,6 +100,9 @@ def _run_text(args: argparse.Namespace) -> int:
         result = tompson.load_tompson(args.predictions, args.ground_truth, args.depth_folder, dataset, args.protocol)
     else:
         result = published.load_published(args.predictions, args.ground_truth, dataset)
+    if args.depth_folder and len(result.predictions) != published.DATASETS['nyu'].frames:
+        raise InputError('--depth-folder needs all 8252 test frames of NYU: which depth image belongs to which row of '
+                         f'{args.predictions} is unknown')
     others = [published.load_result(source, args.ground_truth, dataset) for source in args.compare]
     read_depths = partial(tompson.read_nyu_depths, args.depth_folder) if args.depth_folder else None
     _deliver(args, result, others, read_depths)

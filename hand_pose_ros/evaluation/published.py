@@ -139,10 +139,14 @@ def load_published(predictions: str | Path, truth: str | Path, dataset: Dataset,
     else:
         rows_p, rows_t, notes = _match_counts(guess, label, dataset)
     whole = len(guess.uvd) == len(label.uvd) == dataset.frames
+    joints, labels = guess.points(camera)[rows_p], label.points(camera)[rows_t]
+    if missed := int((np.isnan(joints) & ~np.isnan(labels)).any(-1).sum()):
+        notes += (f'{missed} joints are missing in {guess.path.name} (nan, or no depth): they count as failures in '
+                  'curves and fractions, and are left out of averages.',)
     return Result(
         name=Path(predictions).name.removesuffix('.gz').removesuffix('.txt'),
         skeleton=dataset.skeleton, intrinsics=camera,
-        predictions=guess.points(camera)[rows_p], truth=label.points(camera)[rows_t],
+        predictions=joints, truth=labels,
         parts=dict(dataset.parts) if whole else {}, notes=notes,
         info={'predictions': str(predictions), 'ground_truth': str(truth), 'dataset': dataset.name,
               'intrinsics': f'fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g}'})

@@ -15,10 +15,10 @@ _ROUNDS = 12
 
 # Capsules: 0-2 thumb, 3-14 index to little finger (three each), 15-18 the palm along the metacarpals.
 _PAIRS = torch.tensor(
-    [(a, b) for a in (1, 2) for b in range(3, 19)]                                          # thumb: fingers, palm
-    + [(3 * i + a, 3 * j + b) for i in range(1, 5) for j in range(i + 1, 5) if j - i < 3 for a in range(3) for b in range(3)
-       if a + b > 0]                                                                        # finger: finger
-    + [(3 * i + a, b) for i in range(1, 5) for a in (1, 2) for b in (0, 15, 16, 17, 18)])   # finger: ball of the thumb, palm
+    [(a, b) for a in (1, 2) for b in range(3, 19)]  # thumb: fingers, palm
+    + [(3 * i + a, 3 * j + b) for i in range(1, 5) for j in range(i + 1, min(i + 3, 5))
+       for a in range(3) for b in range(3) if a + b > 0]  # finger: finger
+    + [(3 * i + a, b) for i in range(1, 5) for a in (1, 2) for b in (0, 15, 16, 17, 18)])  # finger: ball of thumb, palm
 _FINGER = torch.cat([torch.arange(15) // 3, torch.full((4,), 5)])  # the digit of a capsule, 5 = palm
 _GIVE = torch.where((_FINGER[_PAIRS].min(1).values > 0) & (_FINGER[_PAIRS].max(1).values < 5), SQUEEZE, TOLERANCE)
 
@@ -92,8 +92,8 @@ def bring_together(pose: Tensor, within: float) -> Tensor:
     """
     shape = mean_shape().to(pose.device)
     steps = torch.zeros(6, len(POSE), device=pose.device)
-    for row, name in enumerate(('thumb_cmc_radial', 'thumb_cmc_palmar', 'thumb_cmc_roll', 'thumb_mcp_flexion', 'thumb_ip_flexion')):
-        steps[row + 1, INDEX[name]] = 0.01
+    for row, angle in enumerate(('cmc_radial', 'cmc_palmar', 'cmc_roll', 'mcp_flexion', 'ip_flexion')):
+        steps[row + 1, INDEX[f'thumb_{angle}']] = 0.01
 
     def gap(angles: Tensor) -> Tensor:
         tips = place_bones(shape, angles)[3][:, :, 3]

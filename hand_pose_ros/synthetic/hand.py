@@ -54,6 +54,9 @@ class SkinnedHand(nn.Module):
     faces: Tensor
     vertex_part: Tensor
     rest: Tensor
+    _to_bone: Tensor
+    _origins: Tensor
+    _basis: Tensor
 
     def __init__(self, vertices: Tensor, faces: Tensor, weights: Tensor, part: Tensor, rotations: Tensor,
                  origins: Tensor, sizes: Tensor, rest: Tensor) -> None:

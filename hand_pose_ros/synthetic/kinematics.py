@@ -15,7 +15,8 @@ from hand_pose_ros.synthetic.shapes import Shape
 
 POSE = (
     'wrist_flexion', 'wrist_deviation', 'ring_cmc_flexion', 'pinky_cmc_flexion',
-    'thumb_cmc_radial', 'thumb_cmc_palmar', 'thumb_cmc_roll', 'thumb_mcp_flexion', 'thumb_mcp_abduction', 'thumb_ip_flexion',
+    'thumb_cmc_radial', 'thumb_cmc_palmar', 'thumb_cmc_roll',
+    'thumb_mcp_flexion', 'thumb_mcp_abduction', 'thumb_ip_flexion',
     *(f'{finger}_{angle}' for finger in FINGERS[1:]
       for angle in ('mcp_flexion', 'mcp_abduction', 'pip_flexion', 'dip_flexion')))
 """Names of the P = 26 angles of a pose (B, P), in radians.
@@ -30,7 +31,11 @@ INDEX = {name: i for i, name in enumerate(POSE)}
 
 BONES = ('forearm', 'wrist', 'carpus', *(f'{f}_metacarpal' for f in FINGERS[1:]),
          *(f'{f}_{b}' for f in FINGERS for b in ('joint1', 'bone1', 'joint2', 'bone2', 'joint3', 'bone3')))
-"""Names of the K = 37 frames that carry the surface. A 'joint' (and the wrist) turns half-way between its neighbours."""
+"""Names of the K = 37 frames that carry the skin. A 'joint' (and the wrist) turns half-way between its neighbours."""
+
+DIGIT = tuple(BONES.index(f'{finger}_joint1') for finger in FINGERS)
+METACARPAL = (BONES.index('carpus'), *(BONES.index(f'{finger}_metacarpal') for finger in FINGERS[1:]))
+"""Of each digit, thumb to little finger: the first of its six frames, and the frame it hangs on."""
 
 _RADIAL = (-1.0, -1.0, 1.0, 1.0)  # sign of the rotation about +z that abducts index, middle, ring and little finger
 _CMC_X, _CMC_Y = (0.50, 1.0, 0.63, 0.56), (0.165, 0.165, 0.175, 0.19)  # CMC over MCP, in x and y
@@ -53,7 +58,7 @@ def _wrist_rotation(pose: Tensor) -> Tensor:
 
 
 def _joint_rotations(pose: Tensor) -> tuple[Tensor, list[Tensor]]:
-    """Of ring and little finger CMC within (B, 4, 3, 3); of first, second and third joint of the digits (B, 5, 3, 3)."""
+    """Turns of the ring and little CMC in (B, 4, 3, 3), and of the three joints of each digit (B, 5, 3, 3)."""
     angle = {name: pose[:, i] for name, i in INDEX.items()}
     still = torch.zeros_like(pose[:, 0])
     cmc = _axis_rotation(0, torch.stack([still, still, angle['ring_cmc_flexion'], angle['pinky_cmc_flexion']], -1))
@@ -123,14 +128,15 @@ def forward(shape: Shape, pose: Tensor, rest: Tensor) -> tuple[Tensor, Tensor, T
     zero = torch.zeros(batch, 1, 3, device=pose.device)
     middle = [parent @ turn for parent, turn in zip(bones, _joint_rotations(half)[1], strict=False)]
     both = [rotation for pair in zip(middle, bones[1:], strict=True) for rotation in pair]
-    rotations = [wrist[:, None], half_wrist[:, None], torch.eye(3, device=pose.device).expand(batch, 1, 3, 3), metacarpal,
+    carpus = torch.eye(3, device=pose.device).expand(batch, 1, 3, 3)
+    rotations = [wrist[:, None], half_wrist[:, None], carpus, metacarpal,
                  torch.stack(both, 2).reshape(batch, 30, 3, 3)]
     origins = [zero, zero, zero, bases, digits[:, :, :3].repeat_interleave(2, 2).reshape(batch, 30, 3)]
     return torch.cat(rotations, 1), torch.cat(origins, 1), torch.cat([zero, digits.reshape(batch, 20, 3)], 1)
 
 
 def bone_sizes(shape: Shape) -> Tensor:
-    """(B, K, 3) width, length and depth of each bone with its flesh, in metres: the surface is scaled by their ratios."""
+    """(B, K, 3) width, length and depth of each bone with its flesh, in metres: the skin scales with them."""
     batch = len(shape)
     carpus = torch.stack([shape.hand_breadth / 2, shape.roots[:, 2, 1], shape.palm_depth], -1)
     forearm = torch.stack([shape.forearm[:, 1], shape.forearm[:, 0], shape.forearm[:, 1]], -1)

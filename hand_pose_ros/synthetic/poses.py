@@ -20,9 +20,10 @@ __all__ = ['LIMITS', 'POSE', 'PROTOTYPES', 'sample_poses']
 _FINGER_LIMITS = {'mcp_flexion': (-25, 92), 'pip_flexion': (-6, 108), 'dip_flexion': (-10, 75)}
 _LIMITS = {
     'wrist_flexion': (-65, 65), 'wrist_deviation': (-32, 22), 'ring_cmc_flexion': (0, 12), 'pinky_cmc_flexion': (0, 22),
-    'thumb_cmc_radial': (-5, 76), 'thumb_cmc_palmar': (-5, 62), 'thumb_cmc_roll': (35, 120), 'thumb_mcp_flexion': (-15, 60),
-    'thumb_mcp_abduction': (-12, 18), 'thumb_ip_flexion': (-25, 80), 'index_mcp_abduction': (-14, 28),
-    'middle_mcp_abduction': (-14, 14), 'ring_mcp_abduction': (-14, 25), 'pinky_mcp_abduction': (-16, 44)}
+    'thumb_cmc_radial': (-5, 76), 'thumb_cmc_palmar': (-5, 62), 'thumb_cmc_roll': (35, 120),
+    'thumb_mcp_flexion': (-15, 60), 'thumb_mcp_abduction': (-12, 18), 'thumb_ip_flexion': (-25, 80),
+    'index_mcp_abduction': (-14, 28), 'middle_mcp_abduction': (-14, 14),
+    'ring_mcp_abduction': (-14, 25), 'pinky_mcp_abduction': (-16, 44)}
 LIMITS = torch.deg2rad(torch.tensor([_LIMITS.get(n) or _FINGER_LIMITS[n.split('_', 1)[1]] for n in POSE],
                                     dtype=torch.float32))
 """(P, 2) least and greatest angle, radians."""
@@ -44,30 +45,41 @@ _THUMB = {
 # Weight, curl of index to little finger, spread, thumb.
 _TABLE = (
     # open hands
-    (4.0, 'SSSS', 'together', 'side'), (4.0, 'SSSS', 'apart', 'rest'), (8.0, 'SSSS', 'wide', 'out'), (3.0, 'SSSS', 'apart', 'out'),
+    (4.0, 'SSSS', 'together', 'side'), (4.0, 'SSSS', 'apart', 'rest'), (8.0, 'SSSS', 'wide', 'out'),
+    (3.0, 'SSSS', 'apart', 'out'),
     (2.0, 'OOOO', 'wide', 'out'), (1.0, 'SSSS', 'vulcan', 'out'), (2.0, 'SSSS', 'together', 'out'),
     # relaxed, half closed
-    (5.0, 'RRRR', 'apart', 'rest'), (4.0, 'CCHH', 'together', 'rest'), (3.0, 'HHHH', 'together', 'rest'), (2.0, 'RHHG', 'together', 'side'),
+    (5.0, 'RRRR', 'apart', 'rest'), (4.0, 'CCHH', 'together', 'rest'), (3.0, 'HHHH', 'together', 'rest'),
+    (2.0, 'RHHG', 'together', 'side'),
     # fists
-    (5.0, 'FFFF', 'together', 'across'), (2.0, 'FFFF', 'together', 'side'), (3.0, 'FFFF', 'together', 'up'), (1.5, 'TTTT', 'together', 'tucked'),
-    (2.0, 'GGGG', 'together', 'wrap'), (1.5, 'KKKK', 'together', 'side'), (1.0, 'KKKK', 'apart', 'rest'), (1.5, 'BBBB', 'together', 'side'),
+    (5.0, 'FFFF', 'together', 'across'), (2.0, 'FFFF', 'together', 'side'), (3.0, 'FFFF', 'together', 'up'),
+    (1.5, 'TTTT', 'together', 'tucked'),
+    (2.0, 'GGGG', 'together', 'wrap'), (1.5, 'KKKK', 'together', 'side'), (1.0, 'KKKK', 'apart', 'rest'),
+    (1.5, 'BBBB', 'together', 'side'),
     (1.0, 'BBBB', 'together', 'wrap'),
     # points
-    (4.0, 'SFFF', 'together', 'across'), (2.5, 'SFFF', 'together', 'out'), (2.0, 'SFFF', 'together', 'side'), (1.5, 'SGGG', 'together', 'rest'),
+    (4.0, 'SFFF', 'together', 'across'), (2.5, 'SFFF', 'together', 'out'), (2.0, 'SFFF', 'together', 'side'),
+    (1.5, 'SGGG', 'together', 'rest'),
     (1.0, 'KFFF', 'together', 'across'),
     # counts
-    (3.0, 'SSFF', 'vee', 'across'), (1.5, 'SSFF', 'together', 'across'), (1.5, 'SSFF', 'vee', 'out'), (2.0, 'SSSF', 'apart', 'across'),
+    (3.0, 'SSFF', 'vee', 'across'), (1.5, 'SSFF', 'together', 'across'), (1.5, 'SSFF', 'vee', 'out'),
+    (2.0, 'SSSF', 'apart', 'across'),
     (2.0, 'SSSS', 'apart', 'tucked'), (2.0, 'SSSS', 'wide', 'tucked'), (1.0, 'SSSF', 'apart', 'pinky'),
     # pinches
-    (3.0, 'PRRR', 'apart', 'index'), (2.0, 'PSSS', 'apart', 'index'), (2.0, 'PHGG', 'together', 'index'), (1.0, 'PFFF', 'together', 'index'),
-    (1.5, 'RPRR', 'apart', 'middle'), (1.0, 'SPSS', 'apart', 'middle'), (1.5, 'SSPS', 'apart', 'ring'), (1.5, 'SSSP', 'apart', 'pinky'),
+    (3.0, 'PRRR', 'apart', 'index'), (2.0, 'PSSS', 'apart', 'index'), (2.0, 'PHGG', 'together', 'index'),
+    (1.0, 'PFFF', 'together', 'index'),
+    (1.5, 'RPRR', 'apart', 'middle'), (1.0, 'SPSS', 'apart', 'middle'), (1.5, 'SSPS', 'apart', 'ring'),
+    (1.5, 'SSSP', 'apart', 'pinky'),
     (2.0, 'PPRR', 'together', 'middle'), (1.5, 'PPPP', 'together', 'middle'), (1.5, 'GGGG', 'together', 'key'),
     # grasps around balls, cylinders, plates, pens
-    (3.0, 'CCCC', 'apart', 'cup'), (2.0, 'RRRR', 'wide', 'cup'), (2.0, 'HHHH', 'apart', 'cup'), (3.0, 'GGGG', 'together', 'cup'),
+    (3.0, 'CCCC', 'apart', 'cup'), (2.0, 'RRRR', 'wide', 'cup'), (2.0, 'HHHH', 'apart', 'cup'),
+    (3.0, 'GGGG', 'together', 'cup'),
     (1.5, 'BBBB', 'apart', 'cup'), (1.5, 'CCGG', 'together', 'index'), (1.0, 'RRRR', 'together', 'side'),
     # signs
-    (1.5, 'SFFS', 'horns', 'across'), (1.0, 'SFFS', 'horns', 'out'), (1.5, 'FFFS', 'horns', 'out'), (1.0, 'FFFS', 'horns', 'across'),
-    (1.0, 'FSSS', 'apart', 'across'), (1.0, 'FSFF', 'together', 'across'), (1.0, 'BSSS', 'apart', 'side'), (1.0, 'SBFF', 'together', 'index'))
+    (1.5, 'SFFS', 'horns', 'across'), (1.0, 'SFFS', 'horns', 'out'), (1.5, 'FFFS', 'horns', 'out'),
+    (1.0, 'FFFS', 'horns', 'across'),
+    (1.0, 'FSSS', 'apart', 'across'), (1.0, 'FSFF', 'together', 'across'), (1.0, 'BSSS', 'apart', 'side'),
+    (1.0, 'SBFF', 'together', 'index'))
 
 _FINGER_NAMES = ('index', 'middle', 'ring', 'pinky')
 _MCP, _ABDUCTION, _PIP, _DIP = (torch.tensor([INDEX[f'{f}_{a}'] for f in _FINGER_NAMES])
@@ -134,7 +146,8 @@ def sample_poses(rng: Random) -> Tensor:
         pulled[:, 1:] += pull * (bend[:, :-1] - bend[:, 1:])
         pulled[:, :-1] += pull * (bend[:, 1:] - bend[:, :-1])
         pose[:, joint] = pulled
-    pose[:, _DIP] = pose[:, _PIP] * (0.55 + rng.normal(1, std=0.10) + rng.normal(4, std=0.06)) + torch.deg2rad(rng.normal(4, std=4.0))
+    follow = 0.55 + rng.normal(1, std=0.10) + rng.normal(4, std=0.06)
+    pose[:, _DIP] = pose[:, _PIP] * follow + torch.deg2rad(rng.normal(4, std=4.0))
     # The arch of the palm deepens as ring and little finger close, more so against the thumb.
     closed = pose[:, _MCP[2:]].clamp(0) / high[_MCP[2:]]
     arch = (0.55 * closed + 0.25 * (pose[:, INDEX['thumb_cmc_palmar'], None] / high[INDEX['thumb_cmc_palmar']]).clamp(0)

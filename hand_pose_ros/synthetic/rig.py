@@ -5,25 +5,27 @@ from __future__ import annotations
 import json
 import struct
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.skeleton import FINGERS
 from hand_pose_ros.synthetic.hand import SkinnedHand
-from hand_pose_ros.synthetic.kinematics import BONES, POSE, bone_sizes, metacarpal_bases
+from hand_pose_ros.synthetic.kinematics import BONES, DIGIT, METACARPAL, POSE, bone_sizes, metacarpal_bases
 from hand_pose_ros.synthetic.shapes import FINGER_END, Shape, make_shape
+
+Array = NDArray[Any]
 
 _TYPES = {5121: '<u1', 5123: '<u2', 5125: '<u4', 5126: '<f4'}
 _WIDTHS = {'SCALAR': 1, 'VEC2': 2, 'VEC3': 3, 'VEC4': 4, 'MAT4': 16}
-_CHAINS = {finger: (['thumb-metacarpal', 'thumb-phalanx-proximal', 'thumb-phalanx-distal', 'thumb-tip'] if finger == 'thumb'
-                    else [f'{finger}-finger-phalanx-{part}' for part in ('proximal', 'intermediate', 'distal')]
-                    + [f'{finger}-finger-tip']) for finger in FINGERS}
+_CHAINS = {'thumb': [f'thumb-{part}' for part in ('metacarpal', 'phalanx-proximal', 'phalanx-distal', 'tip')],
+           **{finger: [f'{finger}-finger-{part}' for part in
+                       ('phalanx-proximal', 'phalanx-intermediate', 'phalanx-distal', 'tip')] for finger in FINGERS[1:]}}
 """WebXR joints that begin the three bones of each digit, and its tip."""
 
 
@@ -43,7 +45,7 @@ class _Glb:
         except (OSError, ValueError, struct.error) as error:
             raise InputError(f'cannot use {path} as a hand rig: {error}; give a .glb of a skinned hand') from error
 
-    def array(self, index: int) -> NDArray[Any]:
+    def array(self, index: int) -> Array:
         """The numbers of an accessor, (N, width)."""
         accessor = self.json['accessors'][index]
         view = self.json['bufferViews'][accessor['bufferView']]
@@ -53,8 +55,8 @@ class _Glb:
         return np.ndarray((accessor['count'], width), dtype, self._blob, start, (stride, dtype.itemsize)).copy()
 
 
-def _read(path: Path) -> tuple[NDArray[Any], NDArray[np.int64], NDArray[Any], dict[str, NDArray[Any]]]:
-    """Vertices (V, 3), faces (F, 3), weights (V, joints), and the rest transform (4, 4) of each joint by name, in order."""
+def _read(path: Path) -> tuple[Array, NDArray[np.int64], Array, dict[str, Array]]:
+    """Vertices (V, 3), faces (F, 3), weights (V, joints), and the rest transform (4, 4) of each joint, in order."""
     glb = _Glb(path)
     try:
         skin = glb.json['skins'][0]
@@ -80,6 +82,59 @@ def _read(path: Path) -> tuple[NDArray[Any], NDArray[np.int64], NDArray[Any], di
     return np.concatenate(points)[kept], faces, np.concatenate(shares)[kept], dict(zip(names, bind, strict=True))
 
 
+def _turned(path: Path, vertices: Array, faces: Array, joints: dict[str, Array]) -> tuple[Array, Array, dict[str, Array]]:
+    """The same as a right hand in the hand frame, and with the axes of `kinematics`."""
+    missing = [name for name in ('wrist', *chain.from_iterable(_CHAINS.values())) if name not in joints]
+    if missing:
+        raise InputError(f'{path} lacks the WebXR hand joints {", ".join(missing)}: rename the bones of the rig')
+    wrist, index, middle, pinky = (
+        joints[name][:3, 3] for name in ('wrist', *(_CHAINS[finger][0] for finger in ('index', 'middle', 'pinky'))))
+    frame = _axes_along(middle - wrist, index - pinky).T
+    if -joints['wrist'][:3, 1] @ frame[2] < 0:  # the palm lies on the other side: a left hand
+        frame[2] *= -1
+        faces = faces[:, ::-1]
+    turned = {}
+    for name, matrix in joints.items():
+        axes = frame @ matrix[:3, :3]
+        axes = axes / np.linalg.norm(axes, axis=0)
+        along, palmar = -axes[:, 2], -axes[:, 1]
+        turned[name] = np.column_stack([np.cross(along, palmar), along, palmar, frame @ (matrix[:3, 3] - wrist)])
+    return (vertices - wrist) @ frame.T, faces, turned
+
+
+def _axes_along(direction: Array, across: Array) -> Array:
+    """The frame (3, 3), columns x y z, whose y runs along `direction` (3,) and whose x is nearest to `across` (3,)."""
+    y = direction / np.linalg.norm(direction)
+    x = across - (across @ y) * y
+    x /= np.linalg.norm(x)
+    return np.stack([x, y, np.cross(x, y)], 1)
+
+
+def _measure(path: Path, points: Array, shares: Array, heads: Array, rotations: Array) -> Shape:
+    """The measures of the rig at rest: from its joints (5, 4, 3), and from the skin for what those do not say."""
+    radii, ends, lengths = np.zeros((5, 3)), np.zeros(5), np.linalg.norm(np.diff(heads, axis=1), axis=2)
+    for digit in range(5):
+        for i in range(3):
+            bone = DIGIT[digit] + 2 * i + 1
+            own = (points[shares[:, bone] > 0.5] - heads[digit, i]) @ rotations[bone]
+            beside = own[(own[:, 1] > 0) & (own[:, 1] < lengths[digit, i])]
+            straight = rotations[bone][:, 1] @ (heads[digit, i + 1] - heads[digit, i]) > 0.8 * lengths[digit, i]
+            if not straight or not len(beside):
+                raise InputError(f'{path}: {_CHAINS[FINGERS[digit]][i]} does not carry skin along its -z axis, as '
+                                 'bones of WebXR do; export the rig with the orientation of WebXR')
+            radii[digit, i], ends[digit] = np.median(np.hypot(beside[:, 0], beside[:, 2])), own[:, 1].max()
+    lengths[:, 2] = ends - FINGER_END * radii[:, 2]
+
+    knuckles = points[np.abs(points[:, 1] - 0.9 * heads[2, 0, 1]) < 0.1 * heads[2, 0, 1], 0]
+    breadth = np.ptp(knuckles[knuckles < heads[1, 0, 0] + 0.02])  # without the thumb
+    measured = make_shape(_tensor(points[shares[:, DIGIT[2] + 5] > 0.5, 1].max())[None], _tensor(breadth)[None])
+    return replace(measured, roots=_tensor(heads[:, 0])[None], segments=_tensor(lengths)[None], radii=_tensor(radii)[None])
+
+
+def _tensor(array: Any) -> torch.Tensor:
+    return torch.tensor(np.asarray(array), dtype=torch.float32)
+
+
 class Rig(SkinnedHand):
     """A hand from a glTF file, driven by the same shapes and poses as `HandModel`; it has no forearm of its own.
 
@@ -100,79 +155,27 @@ class Rig(SkinnedHand):
     def __init__(self, path: str | Path) -> None:
         path = Path(path)
         vertices, faces, weights, joints = _read(path)
-        wanted = ['wrist', *(name for chain in _CHAINS.values() for name in chain)]
-        missing = [name for name in wanted if name not in joints]
-        if missing:
-            raise InputError(f'{path} lacks the WebXR hand joints {", ".join(missing)}: rename the bones of the rig')
+        points, faces, joints = _turned(path, vertices, faces, joints)
+        heads = np.array([[joints[name][:, 3] for name in names] for names in _CHAINS.values()])
 
-        place = {name: matrix[:3, 3] for name, matrix in joints.items()}
-        first = {finger: place[chain[0]] for finger, chain in _CHAINS.items()}
-        along = first['middle'] - place['wrist']
-        across = first['index'] - first['pinky']
-        y = along / np.linalg.norm(along)
-        x = across - (across @ y) * y
-        x /= np.linalg.norm(x)
-        frame = np.stack([x, y, np.cross(x, y)])
-        if -joints['wrist'][:3, 1] @ frame[2] < 0:  # the palm lies on the other side: a left hand
-            frame[2] *= -1
-            faces = faces[:, ::-1]
-        points = (vertices - place['wrist']) @ frame.T
-        heads = np.array([[(place[name] - place['wrist']) @ frame.T for name in chain] for chain in _CHAINS.values()])
-
-        # Bones of ours that carry what each joint of the rig carries, and their axes: x, y along the bone, z palmar.
-        rotations, shares = np.tile(np.eye(3), (len(BONES), 1, 1)), np.zeros((len(points), len(BONES)))
-        owner = {name: BONES.index(f'{finger}_bone{min(i, 2) + 1}')
-                 for finger, chain in _CHAINS.items() for i, name in enumerate(chain)}
-        owner |= {f'{finger}-finger-metacarpal': BONES.index(f'{finger}_metacarpal') for finger in FINGERS[1:]}
+        # The bones of ours that carry what each joint of the rig carries, and their axes.
+        owner = {name: DIGIT[digit] + 2 * min(i, 2) + 1
+                 for digit, names in enumerate(_CHAINS.values()) for i, name in enumerate(names)}
+        owner |= {f'{finger}-finger-metacarpal': METACARPAL[digit] for digit, finger in enumerate(FINGERS) if digit}
+        rotations, origins = np.tile(np.eye(3), (len(BONES), 1, 1)), np.zeros((len(BONES), 3))
+        shares = np.zeros((len(points), len(BONES)))
         for column, name in enumerate(joints):
-            bone = owner.get(name, BONES.index('carpus'))
-            shares[:, bone] += weights[:, column]
+            shares[:, owner.get(name, METACARPAL[0])] += weights[:, column]
             if name in owner and not name.endswith('-tip'):
-                axes = frame @ joints[name][:3, :3]
-                axes /= np.linalg.norm(axes, axis=0)
-                rotations[bone] = np.stack([np.cross(-axes[:, 2], -axes[:, 1]), -axes[:, 2], -axes[:, 1]], 1)
+                rotations[owner[name]], origins[owner[name]] = joints[name][:, :3], joints[name][:, 3]
 
-        radii, lengths, ends = np.zeros((5, 3)), np.linalg.norm(np.diff(heads, axis=1), axis=2), np.zeros(5)
-        for digit, finger in enumerate(FINGERS):
-            for i in range(3):
-                bone = BONES.index(f'{finger}_bone{i + 1}')
-                if rotations[bone][:, 1] @ (heads[digit, i + 1] - heads[digit, i]) < 0.8 * lengths[digit, i]:
-                    raise InputError(f'{path}: the axes of {_CHAINS[finger][i]} are not those of WebXR, whose -z runs along '
-                                     'the bone; export the rig with the orientation of WebXR')
-                own = (points[shares[:, bone] > 0.5] - heads[digit, i]) @ rotations[bone]
-                beside = own[(own[:, 1] > 0) & (own[:, 1] < lengths[digit, i])]
-                radii[digit, i] = np.median(np.hypot(beside[:, 0], beside[:, 2]))
-                ends[digit] = own[:, 1].max()
-        segments = lengths.copy()
-        segments[:, 2] = ends - FINGER_END * radii[:, 2]
-
-        length = float(points[shares[:, BONES.index('middle_bone3')] > 0.5, 1].max())
-        knuckles = points[np.abs(points[:, 1] - 0.9 * heads[2, 0, 1]) < 0.1 * heads[2, 0, 1]]
-        knuckles = knuckles[knuckles[:, 0] < heads[1, 0, 0] + 0.02]  # without the thumb
-        number = lambda array: torch.tensor(np.asarray(array), dtype=torch.float32)[None]  # noqa: E731
-        self_shape = replace(make_shape(number(length), number(np.ptp(knuckles[:, 0]))),
-                             roots=number(heads[:, 0]), segments=number(segments), radii=number(radii))
-
-        origins = np.zeros((len(BONES), 3))
-        origins[3:7] = metacarpal_bases(self_shape)[0].numpy()
-        for digit, finger in enumerate(FINGERS):
-            for i in range(3):
-                origins[BONES.index(f'{finger}_bone{i + 1}')] = heads[digit, i]
-            if digit:
-                toward = heads[digit, 0] - origins[2 + digit]
-                rotations[2 + digit] = _axes_along(toward, rotations[2 + digit])
+        shape = _measure(path, points, shares, heads, rotations)
+        for digit, base in enumerate(metacarpal_bases(shape)[0].numpy(), start=1):
+            bone = METACARPAL[digit]
+            rotations[bone], origins[bone] = _axes_along(heads[digit, 0] - base, rotations[bone][:, 0]), base
         part = np.full(len(points), 5)
         for digit in range(5):
-            part[shares[:, 7 + 6 * digit + (2 if digit == 0 else 0):13 + 6 * digit].sum(1) > 0.5] = digit
-
-        super().__init__(number(points)[0], torch.from_numpy(faces.copy()), number(shares)[0], torch.from_numpy(part),
-                         number(rotations)[0], number(origins)[0], bone_sizes(self_shape)[0], torch.zeros(len(POSE)))
-        self.shape = self_shape
-
-
-def _axes_along(direction: NDArray[Any], axes: NDArray[Any]) -> NDArray[Any]:
-    """The frame nearest to `axes` (3, 3) whose y runs along `direction` (3,)."""
-    y = direction / np.linalg.norm(direction)
-    x = axes[:, 0] - (axes[:, 0] @ y) * y
-    x /= np.linalg.norm(x)
-    return np.stack([x, y, np.cross(x, y)], 1)
+            part[shares[:, DIGIT[digit] + (2 if digit == 0 else 0):DIGIT[digit] + 6].sum(1) > 0.5] = digit
+        super().__init__(_tensor(points), torch.from_numpy(faces.copy()), _tensor(shares), torch.from_numpy(part),
+                         _tensor(rotations), _tensor(origins), bone_sizes(shape)[0], torch.zeros(len(POSE)))
+        self.shape = shape

@@ -22,11 +22,13 @@ FINGER_END = 0.92
 the pulp, about one fingertip radius inside the end."""
 
 # Bones along each digit over hand length, to the end of the finger. Thumb: metacarpal, proximal, distal.
-_SEGMENTS = ((0.251, 0.196, 0.158), (0.251, 0.138, 0.112), (0.272, 0.163, 0.119), (0.253, 0.156, 0.117), (0.198, 0.117, 0.104))
+_SEGMENTS = ((0.251, 0.196, 0.158), (0.251, 0.138, 0.112), (0.272, 0.163, 0.119), (0.253, 0.156, 0.117),
+             (0.198, 0.117, 0.104))
 # Where the digits begin: x over hand breadth, y over hand length, z over hand breadth (the arch of the palm).
 _ROOTS = ((0.215, 0.105, 0.13), (0.252, 0.447, 0.02), (0.0, 0.446, 0.0), (-0.220, 0.422, 0.015), (-0.415, 0.382, 0.06))
 # Half thickness of the flesh over half the breadth.
-_RADII = ((0.400, 0.234, 0.222), (0.231, 0.196, 0.176), (0.228, 0.199, 0.180), (0.212, 0.186, 0.169), (0.191, 0.166, 0.152))
+_RADII = ((0.400, 0.234, 0.222), (0.231, 0.196, 0.176), (0.228, 0.199, 0.180), (0.212, 0.186, 0.169),
+          (0.191, 0.166, 0.152))
 
 
 @dataclass(frozen=True)
@@ -100,15 +102,17 @@ def make_shape(length: Tensor, breadth: Tensor, bone_scale: Tensor | None = None
 
 def mean_shape(sex: str = 'both') -> Shape:
     """One hand of average proportions: the mean 'man', the mean 'woman', or half-way between them ('both')."""
-    length, breadth = {'man': MEN, 'woman': WOMEN, 'both': tuple(sum(pair) / 2 for pair in zip(MEN, WOMEN, strict=True))}[sex]
+    both = tuple((man + woman) / 2 for man, woman in zip(MEN, WOMEN, strict=True))
+    length, breadth = {'man': MEN, 'woman': WOMEN, 'both': both}[sex]
     return make_shape(torch.tensor([length]), torch.tensor([breadth]))
 
 
 def sample_shapes(rng: Random) -> Shape:
     """One hand for each stream of `rng`: 45 % men, 40 % women, 15 % children of about five to fourteen years.
 
-    Length and breadth of the hand are correlated (0.6 within a sex). Every segment departs from its proportion by about
-    5.5 %: shared along a finger, shared across the fingers, and its own, in equal parts. Flesh: 5 % common, 2 % its own.
+    Length and breadth of the hand are correlated (0.6 within a sex). Every segment departs from its proportion by
+    about 5.5 %: shared along a finger, shared across the fingers, and its own, in equal parts. Flesh: 5 % common, 2 %
+    its own.
     """
     kind = rng.choice(torch.tensor([0.45, 0.40, 0.15]))
     mean = torch.tensor([MEN, WOMEN, (0.147, 0.067)], device=rng.device)[kind]
@@ -119,9 +123,10 @@ def sample_shapes(rng: Random) -> Shape:
     breadth = mean[:, 1] + spread[:, 1] * (
         correlation * draw[:, 0] + torch.sqrt(1 - correlation * correlation) * draw[:, 1])
 
-    bones = 1 + (rng.normal(5, 1, std=0.032) + rng.normal(1, 3, std=0.032) + rng.normal(5, 3, std=0.032)).clamp(-0.14, 0.14)
-    roots = 1 + torch.stack([rng.normal(5, std=0.04), rng.normal(5, std=0.02), rng.normal(5, std=0.25)], -1).clamp(-0.5, 0.5)
+    bones = rng.normal(5, 1, std=0.032) + rng.normal(1, 3, std=0.032) + rng.normal(5, 3, std=0.032)
+    roots = torch.stack([rng.normal(5, std=0.04), rng.normal(5, std=0.02), rng.normal(5, std=0.25)], -1)
     chubby = torch.tensor([0.0, 0.0, 0.03], device=rng.device)[kind]
-    flesh = 1 + (rng.normal(1, 1, std=0.05) + rng.normal(5, 1, std=0.015) + rng.normal(5, 3, std=0.02)).clamp(-0.15, 0.15)
+    flesh = rng.normal(1, 1, std=0.05) + rng.normal(5, 1, std=0.015) + rng.normal(5, 3, std=0.02)
     girth = 1 + rng.normal(4).clamp(-2, 2) * flesh.new_tensor([0.06, 0.06, 0.05, 0.09])
-    return make_shape(length, breadth, bones, roots, flesh + chubby[:, None, None], girth)
+    return make_shape(length, breadth, 1 + bones.clamp(-0.14, 0.14), 1 + roots.clamp(-0.5, 0.5),
+                      1 + flesh.clamp(-0.15, 0.15) + chubby[:, None, None], girth)

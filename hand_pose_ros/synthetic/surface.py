@@ -1,18 +1,21 @@
 """The skin of the average hand at rest, as one seamless mesh that knows which bones carry it.
 
 The hand is modelled the way a sculptor in clay would: tapered rolls and pads around the bones, smoothed into each other
-(a signed distance function), and the surface is then read off with a lattice (surface nets, Gibson 1998). Nothing is
-loaded: measures come from `shapes`, so the surface is as free as the numbers in it.
+(a signed distance), and a mesh is then read off it. Nothing is loaded: measures come from `shapes`, so the surface is
+as free as the numbers in it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hand_pose_ros.synthetic.kinematics import DIGIT, METACARPAL
 from hand_pose_ros.synthetic.shapes import FINGER_END
+from hand_pose_ros.synthetic.surface_nets import fair, neighbour_mean, surface_nets, triangles
 
 Array = NDArray[np.float64]
 
@@ -79,7 +82,7 @@ def _sheet(p: Array, a: Array, b: Array, c: Array, radius: float) -> Array:
 
 def _finger(rest: RestHand, p: Array, digit: int) -> Array:
     """Distance to the phalanges of a digit (0 = thumb)."""
-    bones = [7 + 6 * digit + i for i in (1, 3, 5)]
+    bones = [DIGIT[digit] + i for i in (1, 3, 5)]
     lengths, radii = rest.segments[digit], rest.radii[digit]
     tip = FINGER_END * radii[2]
     first = 1 if digit == 0 else 0
@@ -102,44 +105,49 @@ def _finger(rest: RestHand, p: Array, digit: int) -> Array:
 def _palm(rest: RestHand, p: Array) -> Array:
     """Distance to the palm with its pads, hollow and finger webs, without the thumb."""
     depth, b, length = rest.palm_depth, rest.breadth, rest.length
-    roots = [rest.origins[7 + 6 * i] for i in range(5)]
+    roots = [rest.origins[DIGIT[i]] for i in range(5)]
     d = np.full(len(p), np.inf)
     # Metacarpals, close under the skin of the back.
     for i in range(1, 5):
-        q = rest.local(p, 2 + i)
-        reach = np.linalg.norm(roots[i] - rest.origins[2 + i])
+        q = rest.local(p, METACARPAL[i])
+        reach = float(np.linalg.norm(roots[i] - rest.origins[METACARPAL[i]]))
         size = (1.0, 1.0, 0.96, 0.88)[i - 1]
         part = _roll(q, (0, -0.004, 0.001), (0, reach, 0.001), 0.78 * depth * size, 0.84 * depth * size)
-        flesh = _roll(q, (0, 0, 0.40 * depth), (0, reach - 0.006, 0.24 * depth), 0.72 * depth * size, 0.76 * depth * size)
+        flesh = _roll(q, (0, 0, 0.40 * depth), (0, reach - 0.006, 0.24 * depth),
+                      0.72 * depth * size, 0.76 * depth * size)
         part = _blend(part, flesh, 0.5 * depth)
         d = _blend(d, part, 0.010) if i > 1 else part
     # Pads at the roots of the fingers, and the webs between them.
     for i in range(1, 5):
-        bone = 7 + 6 * i + 1
+        bone = DIGIT[i] + 1
         r = rest.radii[i, 0]
         q = rest.local(p, bone)
-        d = _blend(d, _roll(q, (0, -0.008, 0.34 * r), (0, 0.30 * rest.segments[i, 0], 0.20 * r), 0.98 * r, 0.92 * r), 0.008)
+        root = _roll(q, (0, -0.008, 0.34 * r), (0, 0.30 * rest.segments[i, 0], 0.20 * r), 0.98 * r, 0.92 * r)
+        d = _blend(d, root, 0.008)
     for i in range(1, 4):
-        at = [rest.origins[7 + 6 * j + 1] + rest.rotations[7 + 6 * j + 1] @ np.array(
+        at = [rest.origins[DIGIT[j] + 1] + rest.rotations[DIGIT[j] + 1] @ np.array(
             [0, 0.33 * rest.segments[j, 0], 0.10 * rest.radii[j, 0]]) for j in (i, i + 1)]
         root = (roots[i] + roots[i + 1]) / 2 + np.array([0, 0.002, 0.003])
         d = _blend(d, _sheet(p, at[0], at[1], root, 0.52 * rest.radii[i + 1, 0]), 0.009)
     # Heel of the hand: carpus, hypothenar.
     d = _blend(d, _pad(p, (0.003, 0.014, 0.002), (0.30 * b, 0.030, 1.0 * depth)), 0.010)
-    hypothenar = _roll(p, (-0.20 * b, 0.12 * length, 0.09 * b), (-0.335 * b, 0.29 * length, 0.10 * b), 0.115 * b, 0.13 * b)
+    hypothenar = _roll(p, (-0.20 * b, 0.12 * length, 0.09 * b), (-0.335 * b, 0.29 * length, 0.10 * b),
+                       0.115 * b, 0.13 * b)
     return _blend(d, hypothenar, 0.012)
 
 
 def _thumb_root(rest: RestHand, p: Array) -> tuple[Array, Array]:
     """Distances to the thenar eminence and to the web between thumb and index finger."""
-    q, length, b = rest.local(p, 8), rest.segments[0, 0], rest.breadth
+    q, length, b = rest.local(p, DIGIT[0] + 1), rest.segments[0, 0], rest.breadth
     r = rest.radii[0, 1]
     bone = _roll(q, (0, 0, 0), (0, length, 0), 1.05 * r, 1.10 * r)
     muscle = _roll(q, (0.002, 0.22 * length, 0.004), (0.0, 0.78 * length, 0.003), 0.165 * b, 0.13 * b)
-    ball = _roll(p, (0.10 * b, 0.12 * rest.length, 0.12 * b), tuple(rest.origins[9] * 0.72), 0.12 * b, 0.145 * b)
+    ball = _roll(p, (0.10 * b, 0.12 * rest.length, 0.12 * b), tuple(rest.origins[DIGIT[0] + 2] * 0.72),
+                 0.12 * b, 0.145 * b)
     thenar = _blend(_blend(bone, muscle, 0.008), ball, 0.012)
-    index = rest.origins[13]
-    sheet = _sheet(p, rest.origins[7], rest.origins[9] + rest.rotations[8] @ np.array([0, 0.002, 0]),
+    index = rest.origins[DIGIT[1]]
+    sheet = _sheet(p, rest.origins[DIGIT[0]],
+                   rest.origins[DIGIT[0] + 2] + rest.rotations[DIGIT[0] + 1] @ np.array([0, 0.002, 0]),
                    index + np.array([0.0, -0.006, 0.002]), 0.0065)
     return thenar, sheet
 
@@ -157,11 +165,7 @@ def _forearm(rest: RestHand, p: Array) -> Array:
     k = np.sqrt(x * x + z * z)
     side = k * (k - 1) / np.maximum(np.sqrt((x / rx) ** 2 + (z / rz) ** 2), 1e-9)
     start, end = q[:, 1] - 0.012, -q[:, 1] - rest.forearm[0]
-    return -_blend(-_blend_max(side, end, 0.02), -start, 0.02)
-
-
-def _blend_max(a: Array, b: Array, width: float) -> Array:
-    return -_blend(-a, -b, width)
+    return -_blend(_blend(-side, -end, 0.02), -start, 0.02)  # what is inside all three
 
 
 def distance(rest: RestHand, p: Array) -> Array:
@@ -174,8 +178,6 @@ def distance(rest: RestHand, p: Array) -> Array:
         d = _blend(d, _finger(rest, p, digit), 0.005)
     return d - 0.0003  # flat triangles lie inside a round surface by about as much
 
-
-# Reading off the surface -------------------------------------------------------------------------------------------
 
 def _lattice(rest: RestHand, step: float) -> Array:
     """Lattice points (nx, ny, nz, 3), about `step` apart across the hand, wider along it and towards the elbow."""
@@ -192,92 +194,13 @@ def _lattice(rest: RestHand, step: float) -> Array:
     return grid
 
 
-def _surface_nets(grid: Array, value: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Zero set of `value` (nx, ny, nz) on lattice `grid` -> vertices (V, 3) and quads (Q, 4), outward."""
-    shape = tuple(n - 1 for n in value.shape)
-    total, count = np.zeros((*shape, 3)), np.zeros(shape)
-    crossings = []
-    for axis in range(3):
-        low = [slice(None)] * 3
-        high = [slice(None)] * 3
-        low[axis], high[axis] = slice(None, -1), slice(1, None)
-        a, b = value[tuple(low)], value[tuple(high)]
-        cross = (a < 0) != (b < 0)
-        t = np.where(cross, a / np.where(cross, a - b, 1), 0)[..., None]
-        point = np.where(cross[..., None], grid[tuple(low)] * (1 - t) + grid[tuple(high)] * t, 0)
-        others = [i for i in range(3) if i != axis]
-        for da in (0, 1):
-            for db in (0, 1):  # the four edges of each cell along this axis
-                part = [slice(None)] * 3
-                for other, shift in zip(others, (da, db), strict=True):
-                    part[other] = slice(shift, shift + shape[other])
-                total += point[tuple(part)]
-                count += cross[tuple(part)]
-        crossings.append((axis, cross, a < 0))
-    active = count > 0
-    index = np.full(shape, -1, np.int64)
-    index[active] = np.arange(active.sum())
-    vertices = total[active] / count[active][:, None]
-
-    quads = []
-    for axis, cross, inside in crossings:
-        u, v = (axis + 1) % 3, (axis + 2) % 3
-        at = np.argwhere(cross)
-        at = at[(at[:, u] > 0) & (at[:, v] > 0)]
-        corners = []
-        for du, dv in ((-1, -1), (0, -1), (0, 0), (-1, 0)):
-            cell = at.copy()
-            cell[:, u] += du
-            cell[:, v] += dv
-            corners.append(index[tuple(cell.T)])
-        quad = np.stack(corners, 1)
-        flip = ~inside[tuple(at.T)]
-        quad[flip] = quad[flip][:, ::-1]
-        quads.append(quad)
-    return vertices, np.concatenate(quads)
-
-
-def _gradient(rest: RestHand, p: Array, h: float = 2e-4) -> Array:
-    return np.stack([(distance(rest, p + e) - distance(rest, p - e)) / (2 * h) for e in np.eye(3) * h], -1)
-
-
-def _neighbour_mean(values: Array, quads: NDArray[np.int64]) -> Array:
-    """(V, ...) for each vertex the mean of `values` over its neighbours."""
-    total = np.zeros_like(values)
-    for i in range(4):
-        np.add.at(total, quads[:, i], values[quads[:, (i + 1) % 4]])
-    return total / np.bincount(quads.reshape(-1), minlength=len(values))[:, None]
-
-
-def _fair(rest: RestHand, vertices: Array, quads: NDArray[np.int64]) -> Array:
-    """Even out the vertices along the surface and put them exactly on it."""
-    for relax in (0.6, 0.6, 0.0):
-        vertices = vertices + relax * (_neighbour_mean(vertices, quads) - vertices)
-        for _ in range(2):
-            g = _gradient(rest, vertices)
-            d = distance(rest, vertices)
-            vertices = vertices - np.clip(d / np.maximum((g * g).sum(1), 0.05), -0.003, 0.003)[:, None] * g
-    return vertices
-
-
-def _triangles(vertices: Array, quads: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Split each quad along its shorter diagonal."""
-    p = vertices[quads]
-    short = np.linalg.norm(p[:, 0] - p[:, 2], axis=1) <= np.linalg.norm(p[:, 1] - p[:, 3], axis=1)
-    split = np.where(short[:, None, None], np.array([[0, 1, 2], [0, 2, 3]]), np.array([[0, 1, 3], [1, 2, 3]]))
-    return np.take_along_axis(quads[:, None], split.reshape(-1, 1, 6), 2).reshape(-1, 3)
-
-
-# Who carries which vertex ------------------------------------------------------------------------------------------
-
 def _ramp(x: Array, low: float, high: float) -> Array:
     t = np.clip((x - low) / (high - low), 0, 1)
     return t * t * (3 - 2 * t)
 
 
-def _share(s: Array, reach: float, back: float | None = None) -> tuple[Array, Array, Array]:
-    """Weights of (before, at, after) a joint at distance s along the bone past it, blending over +-reach."""
-    back = reach if back is None else back
+def _share(s: Array, reach: float, back: float) -> tuple[Array, Array, Array]:
+    """Weights of (before, at, after) a joint at distance s along the bone past it, blending from -back to reach."""
     before, after = 1 - _ramp(s, -back, 0), _ramp(s, 0, reach)
     return before, 1 - before - after, after
 
@@ -288,9 +211,9 @@ def _weights(rest: RestHand, p: Array) -> tuple[Array, NDArray[np.int64]]:
     # Which digit (with its metacarpal) a vertex belongs to: sharp between fingers, gradual in the palm.
     near = []
     for digit in range(1, 5):
-        q = rest.local(p, 2 + digit)
-        reach = np.linalg.norm(rest.origins[7 + 6 * digit] - rest.origins[2 + digit])
-        ray = _roll(q, (0, 0, 0), (0, reach, 0), rest.radii[digit, 0], rest.radii[digit, 0])
+        q = rest.local(p, METACARPAL[digit])
+        length = float(np.linalg.norm(rest.origins[DIGIT[digit]] - rest.origins[METACARPAL[digit]]))
+        ray = _roll(q, (0, 0, 0), (0, length, 0), rest.radii[digit, 0], rest.radii[digit, 0])
         near.append(np.minimum(ray, _finger(rest, p, digit)))
     distances = np.stack(near, 1)
     member = np.clip(1 - (distances - distances.min(1, keepdims=True)) / 0.008, 0, 1) ** 2
@@ -298,7 +221,7 @@ def _weights(rest: RestHand, p: Array) -> tuple[Array, NDArray[np.int64]]:
     thenar, _ = _thumb_root(rest, p)
     thumb = np.minimum(thenar, _finger(rest, p, 0))
     d_palm = np.minimum(_palm(rest, p), distances.min(1))
-    q = rest.local(p, 8)
+    q = rest.local(p, DIGIT[0] + 1)
     thumbness = _ramp(d_palm - thumb, -0.010, 0.014) * _ramp(q[:, 1], -0.020, 0.016)
 
     wrist = _share(rest.local(p, 0)[:, 1], 0.022, 0.026)
@@ -306,8 +229,8 @@ def _weights(rest: RestHand, p: Array) -> tuple[Array, NDArray[np.int64]]:
     w[:, 0], w[:, 1] = wrist[0], wrist[1]
     for digit in range(5):
         amount = hand * (thumbness if digit == 0 else (1 - thumbness) * member[:, digit - 1])
-        bones = [7 + 6 * digit + i for i in range(6)]
-        root = 2 if digit == 0 else 2 + digit
+        bones = [DIGIT[digit] + i for i in range(6)]
+        root = METACARPAL[digit]
         if digit:  # the carpus holds the heel of the hand
             s = rest.local(p, root)[:, 1]
             heel = 1 - _ramp(s, -0.002, 0.030)
@@ -317,7 +240,7 @@ def _weights(rest: RestHand, p: Array) -> tuple[Array, NDArray[np.int64]]:
         for i in range(3):
             s = rest.local(p, bones[2 * i + 1])[:, 1]
             r = rest.radii[digit, max(i - 1, 0)]
-            reach = (0.022, 0.026) if (digit == 0 and i == 0) else (1.0 * r, 1.0 * r)
+            reach = (0.022, 0.026) if digit == 0 and i == 0 else (r, r)
             before, at, after = _share(s, *reach)
             w[:, root if i == 0 else bones[2 * i - 1]] += left * before
             w[:, bones[2 * i]] += left * at
@@ -325,7 +248,7 @@ def _weights(rest: RestHand, p: Array) -> tuple[Array, NDArray[np.int64]]:
         w[:, bones[5]] += left
     part = np.full(len(p), 5)
     for digit in range(5):
-        mine = w[:, 7 + 6 * digit + (2 if digit == 0 else 1):13 + 6 * digit].sum(1)
+        mine = w[:, DIGIT[digit] + (2 if digit == 0 else 1):DIGIT[digit] + 6].sum(1)
         part[mine > 0.5] = digit
     part[w[:, 0] + 0.5 * w[:, 1] > 0.5] = 6
     return w / w.sum(1, keepdims=True), part
@@ -340,9 +263,9 @@ def build(rest: RestHand, step: float = 0.0047) -> tuple[Array, NDArray[np.int64
     """
     grid = _lattice(rest, step)
     value = distance(rest, grid.reshape(-1, 3)).reshape(grid.shape[:3])
-    vertices, quads = _surface_nets(grid, value)
-    vertices = _fair(rest, vertices, quads)
+    vertices, quads = surface_nets(grid, value)
+    vertices = fair(partial(distance, rest), vertices, quads)
     weights, part = _weights(rest, vertices)
     for _ in range(2):
-        weights = 0.5 * (weights + _neighbour_mean(weights, quads))
-    return vertices, _triangles(vertices, quads), weights, part
+        weights = 0.5 * (weights + neighbour_mean(weights, quads))
+    return vertices, triangles(vertices, quads), weights, part

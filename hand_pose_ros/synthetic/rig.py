@@ -24,8 +24,8 @@ Array = NDArray[Any]
 _TYPES = {5121: '<u1', 5123: '<u2', 5125: '<u4', 5126: '<f4'}
 _WIDTHS = {'SCALAR': 1, 'VEC2': 2, 'VEC3': 3, 'VEC4': 4, 'MAT4': 16}
 _CHAINS = {'thumb': [f'thumb-{part}' for part in ('metacarpal', 'phalanx-proximal', 'phalanx-distal', 'tip')],
-           **{finger: [f'{finger}-finger-{part}' for part in
-                       ('phalanx-proximal', 'phalanx-intermediate', 'phalanx-distal', 'tip')] for finger in FINGERS[1:]}}
+           **{finger: [*(f'{finger}-finger-phalanx-{part}' for part in ('proximal', 'intermediate', 'distal')),
+                       f'{finger}-finger-tip'] for finger in FINGERS[1:]}}
 """WebXR joints that begin the three bones of each digit, and its tip."""
 
 
@@ -82,7 +82,8 @@ def _read(path: Path) -> tuple[Array, NDArray[np.int64], Array, dict[str, Array]
     return np.concatenate(points)[kept], faces, np.concatenate(shares)[kept], dict(zip(names, bind, strict=True))
 
 
-def _turned(path: Path, vertices: Array, faces: Array, joints: dict[str, Array]) -> tuple[Array, Array, dict[str, Array]]:
+def _turned(path: Path, vertices: Array, faces: Array,
+            joints: dict[str, Array]) -> tuple[Array, Array, dict[str, Array]]:
     """The same as a right hand in the hand frame, and with the axes of `kinematics`."""
     missing = [name for name in ('wrist', *chain.from_iterable(_CHAINS.values())) if name not in joints]
     if missing:
@@ -128,7 +129,8 @@ def _measure(path: Path, points: Array, shares: Array, heads: Array, rotations: 
     knuckles = points[np.abs(points[:, 1] - 0.9 * heads[2, 0, 1]) < 0.1 * heads[2, 0, 1], 0]
     breadth = np.ptp(knuckles[knuckles < heads[1, 0, 0] + 0.02])  # without the thumb
     measured = make_shape(_tensor(points[shares[:, DIGIT[2] + 5] > 0.5, 1].max())[None], _tensor(breadth)[None])
-    return replace(measured, roots=_tensor(heads[:, 0])[None], segments=_tensor(lengths)[None], radii=_tensor(radii)[None])
+    return replace(measured, roots=_tensor(heads[:, 0])[None], segments=_tensor(lengths)[None],
+                   radii=_tensor(radii)[None])
 
 
 def _tensor(array: Any) -> torch.Tensor:

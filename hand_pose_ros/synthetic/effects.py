@@ -116,8 +116,8 @@ def _slope(nearness: Tensor, shot: Shot) -> Tensor:
 def jitter(nearness: Tensor, shot: Shot) -> Tensor:
     """Lateral noise: pixels look beside themselves by N(0, 0.5 px) of the sensor, which frays edges (Handa 2014)."""
     reach = 0.5 * shot.scale * shot.severity
-    across = (shot.field('white') * reach).round().long()
-    down = (shot.field('white') * reach).round().long()
+    across = (shot.field('smooth') * reach).round().long()
+    down = (shot.field('smooth') * reach).round().long()
     rows = (torch.arange(shot.height, device=down.device)[:, None] + down).clamp(0, shot.height - 1)
     columns = (torch.arange(shot.width, device=down.device) + across).clamp(0, shot.width - 1)
     return nearness.flatten(1).gather(1, (rows * shot.width + columns).flatten(1)).reshape_as(nearness)
@@ -143,7 +143,7 @@ def matching_window(nearness: Tensor, shot: Shot) -> Tensor:
     before = nearness - _spread(nearness, torch.minimum) > 0.03 * nearness
     luck = shot.field('smooth') + 0.5 * shot.field('white')
     bar = shot.severity * shot.scale
-    lost = (behind & (luck < 1.2 * bar)) | (before & (luck > 1.9 - 0.9 * bar))
+    lost = (behind & (luck < 1.2 * bar)) | (before & (luck > 2.7 - 0.9 * bar))
     return torch.where(lost, 0, nearness)
 
 
@@ -152,7 +152,7 @@ def disparity_noise(nearness: Tensor, shot: Shot) -> Tensor:
 
     (Khoshelham and Elberink 2012.)
     """
-    noise = (0.8 * shot.field('smooth') + 0.6 * shot.field('white')) * (shot.noise * shot.severity)
+    noise = (0.9 * shot.field('smooth') + 0.4 * shot.field('white')) * (shot.noise * shot.severity)
     disparity = ((nearness * shot.disparity_per_nearness + noise) / shot.step).round() * shot.step
     return torch.where(nearness > 0, disparity / shot.disparity_per_nearness, 0).clamp(min=0)
 
@@ -176,10 +176,10 @@ def edge_smear(nearness: Tensor, shot: Shot) -> Tensor:
     """A pixel gathers light from more than its own square, and the nearer surface sends more: silhouettes grow by about
     a pixel, and their outermost pixels lie 5-40 mm too deep (measured on recordings of a second Kinect)."""
     amount = shot.scale * (0.5 + shot.rng.uniform(1, 1))
-    within = nearness - ((nearness - _mean(nearness)) * (0.06 * amount)).clamp(max=0.015)
+    within = nearness - ((nearness - _mean(nearness)) * (0.12 * amount)).clamp(max=0.03)
     front = _spread(nearness)
-    ramp = 0.004 + 0.045 * (0.5 + 0.3 * shot.field('white')).clamp(0, 1)
-    grows = (front - nearness > 0.05 * front) & (shot.field('smooth') < 1.6 * amount - 0.9)
+    ramp = (0.022 + 0.009 * shot.field('white')).clamp(0.004, 0.04)
+    grows = (front - nearness > 0.05 * front) & (shot.field('smooth') < 2.2 * amount - 0.6)
     return torch.where(grows, front / (1 + front * ramp), within)
 
 
@@ -191,9 +191,9 @@ def flying_pixels(nearness: Tensor, shot: Shot) -> Tensor:
     front, back = _spread(nearness), _spread(nearness, torch.minimum)
     behind = front - nearness > 0.06 * front
     luck = shot.field('white') + shot.field('smooth')
-    kept = 1.2 + 1.2 * shot.rng.uniform(1, 1)  # how sharp the driver's filter is set
+    kept = 2.0 + 2.0 * shot.rng.uniform(1, 1)  # how sharp the driver's filter is set
     between = back + (0.5 + 0.35 * shot.field('white')).clamp(0, 1) * (front - back)
-    return torch.where(behind & (luck > -1.3), torch.where(luck > kept, between, 0), nearness)
+    return torch.where(behind & (luck > -2.0), torch.where(luck > kept, between, 0), nearness)
 
 
 def multipath(nearness: Tensor, shot: Shot) -> Tensor:

@@ -29,6 +29,7 @@ class Sensor:
         noise: standard deviation; of the disparity in pixels, or for time of flight as a factor on Fankhauser's model.
         baseline: from camera to projector or second camera along +x, m.
         step: quantum of the disparity, px.
+        unit: metres per unit of its images.
         smoothing: share of an edge-preserving 3x3 mean in the output (the filters that its driver runs).
     """
 
@@ -41,17 +42,18 @@ class Sensor:
     noise: float
     baseline: float = 0.0
     step: float = 0.0
+    unit: float = 0.001
     smoothing: float = 0.0
 
 
 SENSORS = (
     Sensor('primesense', 'structured_light', Intrinsics(588.03, 587.07, 320, 240, 640, 480), (0.5, 1.1), 0.4, 3.5,
-           noise=0.08, baseline=0.075, step=1 / 8),
+           noise=0.045, baseline=0.075, step=1 / 8),
     Sensor('kinect1', 'structured_light', Intrinsics(585.6, 585.6, 316, 247.6, 640, 480), (0.7, 1.4), 0.5, 4.0,
-           noise=0.10, baseline=0.075, step=1 / 8),
+           noise=0.055, baseline=0.075, step=1 / 8),
     Sensor('sr305', 'structured_light', Intrinsics(476.0, 476.0, 313.7, 242.8, 640, 480), (0.25, 0.8), 0.2, 1.5,
-           noise=0.025, baseline=0.026, step=1 / 32, smoothing=0.8),
-    Sensor('kinect2', 'time_of_flight', Intrinsics(364.5, 364.5, 256, 208, 512, 424), (0.6, 1.2), 0.5, 4.5, noise=1.0),
+           noise=0.018, baseline=0.026, step=1 / 32, unit=0.000125, smoothing=0.8),
+    Sensor('kinect2', 'time_of_flight', Intrinsics(364.5, 364.5, 256, 208, 512, 424), (0.6, 1.2), 0.5, 4.5, noise=1.3),
     Sensor('azure', 'time_of_flight', Intrinsics(504.0, 504.0, 320, 332, 640, 576), (0.3, 1.1), 0.25, 4.0, noise=0.8),
     Sensor('pmd', 'time_of_flight', Intrinsics(210.6, 210.6, 112, 86, 224, 172), (0.25, 0.8), 0.1, 4.0, noise=1.6),
     Sensor('senz3d', 'time_of_flight', Intrinsics(241.4, 241.4, 160, 120, 320, 240), (0.22, 0.65), 0.15, 1.5,
@@ -86,8 +88,8 @@ def sensor_table(field: str, device: torch.device) -> Tensor:
 FAMILIES: dict[str, tuple[Callable[[Tensor, Shot], Tensor], ...]] = {
     'structured_light': (effects.shadow, effects.jitter, effects.matching_window, effects.grazing_holes,
                          effects.disparity_noise, effects.smoothing, effects.dark_spots),
-    'time_of_flight': (effects.multipath, effects.edge_smear, effects.tof_noise, effects.flying_pixels,
-                       effects.grazing_holes, effects.dark_spots),
+    'time_of_flight': (effects.multipath, effects.grazing_holes, effects.edge_smear, effects.tof_noise,
+                       effects.flying_pixels, effects.dark_spots),
     'active_stereo': (effects.shadow, effects.fattening, effects.jitter, effects.grazing_holes,
                       effects.disparity_noise, effects.smoothing, effects.dark_spots),
 }
@@ -119,12 +121,13 @@ def sense(nearness: Tensor, seeds: Tensor, sensor: Tensor, focal: Tensor, mirror
 
         rng = Random(seeds[members])
         focal_here = focal[members][:, None, None]
-        shot = Shot(rng, focal_here, focal_here / of_sensor('fx'), rng.uniform(1, 1, low=0.6, high=1.4),
+        shot = Shot(rng, focal_here, focal_here / of_sensor('fx'), rng.uniform(1, 1, low=0.5, high=1.5),
                     mirrored[members][:, None, None], of_sensor('baseline'), of_sensor('noise'), of_sensor('step'),
                     of_sensor('smoothing'), *nearness.shape[1:])
         image = nearness[members]
         for effect in chain:
             image = effect(image, shot)
-        z = 1 / image.clamp(min=1e-6)
+        unit = of_sensor('unit')
+        z = (1 / image.clamp(min=1e-6) / unit).round() * unit
         depth[members] = torch.where((z >= of_sensor('near')) & (z <= of_sensor('far')), z, 0)
     return depth

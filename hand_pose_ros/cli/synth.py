@@ -1,0 +1,187 @@
+"""`hand-pose synth`: look at synthetic hands, write them to disk, compare them with real ones."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hand_pose_ros.errors import HandPoseError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+    from torch import Tensor
+
+    from hand_pose_ros.drawing import Picture
+    from hand_pose_ros.synthetic.generator import SyntheticHands
+
+_EXAMPLES = """examples:
+  hand-pose synth show hands.png --joints
+  hand-pose synth show sensors.png --per-sensor --number 8
+  hand-pose synth show both.png --sensors kinect2 --real frames/kinect2 363.9 363.9 255.4 206.3 0.001
+  hand-pose synth write data/ --number 100000
+  hand-pose synth stats --sensors kinect2 --real frames/kinect2 363.9 363.9 255.4 206.3 0.001
+"""
+_COLUMNS = 8
+_ZOOM = 2
+
+
+def add_parser(subparsers: Any) -> None:
+    """Declare the verb."""
+    parser = subparsers.add_parser(
+        'synth', help='make or show synthetic depth hands', epilog=_EXAMPLES,
+        description='Hands of many shapes in many poses, seen by simulated depth sensors, as networks are trained on.',
+        formatter_class=argparse.RawDescriptionHelpFormatter)
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument('--split', default='train', choices=('train', 'val', 'test'), help='(train)')
+    common.add_argument('--start', type=int, default=0, metavar='I', help='index of the first sample (0)')
+    common.add_argument('--sensors', nargs='+', metavar='NAME', help='(all)')
+    real = argparse.ArgumentParser(add_help=False)
+    real.add_argument('--real', nargs=6, action='append', default=[],
+                      metavar=('FOLDER', 'FX', 'FY', 'CX', 'CY', 'SCALE'),
+                      help='16-bit depth PNGs, their camera in pixels and metres per unit; may be repeated')
+    actions = parser.add_subparsers(dest='action', metavar='show|write|stats', required=True)
+
+    show = actions.add_parser('show', parents=[common, real], help='a contact sheet')
+    show.add_argument('out', type=Path, metavar='FILE', help='a PNG')
+    show.add_argument('--number', type=_positive, default=48, metavar='N', help='samples, or columns per sensor (48)')
+    show.add_argument('--joints', action='store_true', help='draw the joints; hidden ones hollow')
+    show.add_argument('--clean', action='store_true', help='as a perfect sensor would see them')
+    show.add_argument('--per-sensor', action='store_true', help='the same hands seen by each sensor, one a row')
+
+    write = actions.add_parser('write', parents=[common], help='a dataset in .npz shards')
+    write.add_argument('out', type=Path, metavar='FOLDER')
+    write.add_argument('--number', type=_positive, required=True, metavar='N', help='samples')
+    write.add_argument('--shard', type=_positive, default=4096, metavar='N', help='samples per file (4096)')
+    write.add_argument('--device', default='cpu', help='cpu, cuda or cuda:N (cpu)')
+
+    stats = actions.add_parser('stats', parents=[common, real], help='numbers of synthetic beside real crops')
+    stats.add_argument('--number', type=_positive, default=512, metavar='N', help='synthetic samples (512)')
+    parser.set_defaults(parser=parser)
+
+
+def _positive(text: str) -> int:
+    value = int(text)
+    if value <= 0:
+        raise argparse.ArgumentTypeError(f'{value} is not a positive number')
+    return value
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do one of show, write and stats."""
+    {'show': _show, 'write': _write, 'stats': _stats}[args.action](args)
+    return 0
+
+
+def _hands(args: argparse.Namespace, sensors: list[str] | None, **options: Any) -> SyntheticHands:
+    from hand_pose_ros.synthetic.generator import SyntheticHands
+    try:
+        return SyntheticHands(args.split, sensors=sensors, **options)
+    except ValueError as error:
+        raise HandPoseError(str(error)) from error
+
+
+def _indices(start: int, number: int, step: int) -> Iterator[Tensor]:
+    import torch
+    return iter(torch.arange(start, start + number).split(step))
+
+
+def _real(args: argparse.Namespace) -> Iterator[tuple[str, list[tuple[NDArray[np.float32], float]]]]:
+    from hand_pose_ros.synthetic.statistics import real_patches
+    for folder, *numbers in args.real:
+        try:
+            *intrinsics, scale = map(float, numbers)
+        except ValueError as error:
+            raise HandPoseError(f'--real {folder}: {error}; after the folder come FX FY CX CY SCALE') from error
+        yield Path(folder).name, real_patches(Path(folder), intrinsics, scale)
+
+
+def _show(args: argparse.Namespace) -> None:
+    import cv2
+    import torch
+
+    from hand_pose_ros.drawing import contact_sheet
+    from hand_pose_ros.synthetic.generator import LEFT
+    from hand_pose_ros.synthetic.sensors import SENSORS
+    from hand_pose_ros.synthetic.stages import Ingredients
+
+    names = args.sensors or [sensor.name for sensor in SENSORS]
+    number = args.number if not args.per_sensor else min(args.number, _COLUMNS)
+    pictures = []
+    for name, patches in _real(args):
+        chosen = [patches[i * len(patches) // _COLUMNS][0] for i in range(min(_COLUMNS, len(patches)))]
+        row = [_relief(patch, f'real {name}') for patch in chosen]
+        pictures += row + [row[0] * 0] * (_COLUMNS - len(row)) if row else []
+    for group in [[name] for name in names] if args.per_sensor else [names]:
+        hands = _hands(args, group, ingredients=Ingredients(noise=not args.clean))
+        batch = hands.batch(torch.arange(args.start, args.start + number))
+        for i in range(number):
+            side = 'none' if not batch['hand_present'][i] else 'left' if batch['side'][i] == LEFT else 'right'
+            label = f"{SENSORS[int(batch['sensor'][i])].name} {float(batch['cube_center'][i, 2]):.2f} m {side}"
+            picture = _relief(batch['patch'][i, 0].numpy(), label)
+            if args.joints and side != 'none':
+                _draw_joints(picture, batch['joints'][i].numpy(), batch['visible'][i].numpy())
+            pictures.append(picture)
+    cv2.imwrite(str(args.out), contact_sheet(pictures, columns=min(_COLUMNS, number)))
+    print(f'{args.out}: {len(pictures)} pictures')
+
+
+def _relief(patch: NDArray[np.float32], label: str) -> Picture:
+    """A patch lit from the upper left, unsmoothed, so that its noise can be judged; nothing is dark."""
+    import cv2
+    import numpy as np
+    slope_y, slope_x = np.gradient(patch * (len(patch) / 2))
+    light = (0.4 * slope_x + 0.5 * slope_y + 0.77) / np.sqrt(slope_x ** 2 + slope_y ** 2 + 1)
+    shade = np.clip(light, 0, 1) * 0.75 + 0.125 * (1 - patch)
+    grey = np.where(patch < 1, shade * 255, 40).astype(np.uint8).repeat(_ZOOM, 0).repeat(_ZOOM, 1)
+    picture: Picture = np.repeat(grey[..., None], 3, axis=2)
+    cv2.putText(picture, label, (4, 12), cv2.FONT_HERSHEY_SIMPLEX, 0.38, (90, 220, 255), 1, cv2.LINE_AA)
+    return picture
+
+
+def _draw_joints(picture: Picture, joints: NDArray[np.float32], visible: NDArray[np.bool_]) -> None:
+    import cv2
+
+    from hand_pose_ros.drawing import FINGER_COLORS
+    from hand_pose_ros.skeleton import HAND21
+    at = ((joints[:, :2] + 1) * (len(picture) / 2)).round().astype(int).tolist()
+    colors = [FINGER_COLORS[finger][::-1] for finger in HAND21.fingers]
+    for parent, child in HAND21.bones:
+        cv2.line(picture, at[parent], at[child], colors[child], 1, cv2.LINE_AA)
+    for point, color, seen in zip(at, colors, visible, strict=True):
+        cv2.circle(picture, point, 3, color, cv2.FILLED if seen else 1, cv2.LINE_AA)
+
+
+def _write(args: argparse.Namespace) -> None:
+    import numpy as np
+    from tqdm import tqdm
+
+    hands = _hands(args, args.sensors, device=args.device)
+    args.out.mkdir(parents=True, exist_ok=True)
+    for indices in tqdm(list(_indices(args.start, args.number, args.shard)), unit='shard'):
+        arrays: dict[str, Any] = {name: values.cpu().numpy() for name, values in hands.batch(indices).items()}
+        arrays['index'] = indices.numpy()
+        arrays['patch'] = arrays['patch'].astype(np.float16)  # exact to 0.1 mm
+        path = args.out / f'{args.split}_{int(indices[0]):09d}.npz'
+        unfinished = path.with_suffix('.part')
+        with open(unfinished, 'wb') as file:
+            np.savez_compressed(file, **arrays)
+        os.replace(unfinished, path)
+
+
+def _stats(args: argparse.Namespace) -> None:
+    from hand_pose_ros.synthetic.statistics import summarise
+    columns = {f'real {name}': summarise(patches) for name, patches in _real(args)}
+    hands, patches = _hands(args, args.sensors), []
+    for indices in _indices(args.start, args.number, 64):
+        batch = hands.batch(indices)
+        patches += [(batch['patch'][i, 0].numpy(), float(batch['cube_side'][i]))
+                    for i in batch['hand_present'].nonzero()[:, 0].tolist()]
+    columns['synthetic'] = summarise(patches)
+    print('median (quartiles)'.ljust(20) + ''.join(name.rjust(26) for name in columns))
+    for row in columns['synthetic']:
+        cells = (f'{column[row][1]:.3g} ({column[row][0]:.3g} - {column[row][2]:.3g})' for column in columns.values())
+        print(row.ljust(20) + ''.join(cell.rjust(26) for cell in cells))

@@ -21,6 +21,7 @@ VERBS = {
     'evaluate': 'score a prediction file, or the estimator on a bag',
     'compare': 'several results side by side',
     'train': 'train a network from a recipe',
+    'experiment': 'repeat an experiment of the paper',
     'synth': 'make or show synthetic depth hands',
     'bench': 'measure speed on this machine',
 }

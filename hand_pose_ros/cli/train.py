@@ -13,7 +13,7 @@ EPILOG = """examples:
   hand-pose train paper --out runs/orref --set refiner=or_ref --set base=runs/deep-prior/best.safetensors
   hand-pose train paper --out runs/nyu --set dataset=nyu --set root=/data/NYU
   hand-pose train --out runs/modern --resume
-  torchrun --nproc-per-node 4 --no-python hand-pose train modern --out runs/modern --device cuda --workers 0
+  torchrun --standalone --nproc-per-node 4 --no-python hand-pose train modern --out runs/modern --device cuda --workers 0
 
 recipes: paper, original-code, modern; docs/training.md says what they do and lists every value.
 """
@@ -24,9 +24,15 @@ def add_parser(subparsers: Any) -> None:
                                    formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('recipe', nargs='?', help='paper, original-code or modern (with --resume: that of the run)')
     parser.add_argument('--out', type=Path, required=True, metavar='RUN', help='folder of the run')
+    parser.add_argument('--resume', action='store_true', help='continue the run in RUN')
+    add_machine_arguments(parser)
+    parser.set_defaults(parser=parser)
+
+
+def add_machine_arguments(parser: argparse.ArgumentParser) -> None:
+    """Values of the recipe, and where to train."""
     parser.add_argument('--set', action='append', default=[], metavar='KEY=VALUE', dest='overrides',
                         help='replace a value of the recipe; may be given several times')
-    parser.add_argument('--resume', action='store_true', help='continue the run in RUN')
     parser.add_argument('--device', default='cpu', help='cpu or cuda (default: %(default)s)')
     parser.add_argument('--workers', type=int, default=1,
                         help='processes that render or decode; 0: on the device, for a GPU (default: %(default)s)')
@@ -35,7 +41,13 @@ def add_parser(subparsers: Any) -> None:
                         help='where rendered and decoded samples are kept for all runs (default: %(default)s)')
     parser.add_argument('--cache-gb', type=float, default=40,
                         help='delete the samples used longest ago beyond this size (default: %(default)s)')
-    parser.set_defaults(parser=parser)
+
+
+def machine(args: argparse.Namespace) -> Any:
+    """The `training.loop.Machine` that the arguments name."""
+    from hand_pose_ros.training.loop import Machine
+
+    return Machine(args.cache, args.device, args.workers, args.threads, args.cache_gb)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -45,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
 
     from hand_pose_ros.training.distributed import process_group
     from hand_pose_ros.training.folder import RunFolder
-    from hand_pose_ros.training.loop import Machine, Run
+    from hand_pose_ros.training.loop import Run
     from hand_pose_ros.training.recipes import get_recipe
 
     if args.resume and (args.recipe or args.overrides):
@@ -54,7 +66,6 @@ def run(args: argparse.Namespace) -> int:
         args.parser.error('give a RECIPE (paper, original-code or modern), or --resume')
     logging.basicConfig(level=logging.INFO, format='%(message)s')
     recipe = RunFolder(args.out).recipe() if args.resume else get_recipe(args.recipe, args.overrides)
-    machine = Machine(args.cache, args.device, args.workers, args.threads, args.cache_gb)
     with logging_redirect_tqdm(), process_group(args.device):
-        Run(args.out, recipe, machine).train(args.resume)
+        Run(args.out, recipe, machine(args)).train(args.resume)
     return 0

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import subprocess
 from pathlib import Path
 from typing import Any
 
 from hand_pose_ros.errors import HandPoseError
+from hand_pose_ros.evaluation.results import write_json
 from hand_pose_ros.training.recipes import Recipe, recipe_from_dict, recipe_to_dict
 
 log = logging.getLogger(__name__)
@@ -56,13 +56,15 @@ class RunFolder:
         if self.state.exists():
             raise TrainingError(f'{self.path} holds a run already: continue it with --resume, or choose another --out')
         self.path.mkdir(parents=True, exist_ok=True)
-        write_json(self.path / 'config.json', {'recipe': recipe_to_dict(recipe), 'git': _git_revision()})
+        write_json({'recipe': recipe_to_dict(recipe), 'git': _git_revision()}, self.path / 'config.json')
 
     def open(self) -> None:
         """Begin to write."""
         self._log = logging.FileHandler(self.path / 'log.txt')
         self._log.setFormatter(logging.Formatter('%(asctime)s %(message)s'))
-        logging.getLogger('hand_pose_ros').addHandler(self._log)
+        logger = logging.getLogger(__package__)
+        logger.addHandler(self._log)
+        logger.setLevel(logging.INFO)
         try:
             from torch.utils.tensorboard import SummaryWriter
             self._tensorboard = SummaryWriter(str(self.path))
@@ -81,15 +83,8 @@ class RunFolder:
         if self._tensorboard is not None:
             self._tensorboard.close()
         if self._log is not None:
-            logging.getLogger('hand_pose_ros').removeHandler(self._log)
+            logging.getLogger(__package__).removeHandler(self._log)
             self._log.close()
-
-
-def write_json(path: Path, values: Any) -> None:
-    """In one step, so that no reader sees half of it."""
-    temporary = path.with_name(f'.{path.name}.{os.getpid()}.tmp')
-    temporary.write_text(json.dumps(values, indent=2) + '\n', encoding='utf-8')
-    os.replace(temporary, path)
 
 
 def _git_revision() -> str | None:

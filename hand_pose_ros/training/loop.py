@@ -168,7 +168,7 @@ class Run:
             self.folder.create(self.recipe)
         if self.rank == 0:
             self.folder.open()
-        log.info('step %s of %s, %s', self.step, self.steps, self.recipe)
+            log.info('step %s of %s, %s', self.step, self.steps, self.recipe)
         try:
             with self._signals():
                 return self._loop(self._distributed())
@@ -224,7 +224,7 @@ class Run:
         self.optimizer.step()
         if recipe.average:
             self._update_average()
-        return terms
+        return {name: value.detach() for name, value in terms.items()}
 
     def _autocast(self) -> AbstractContextManager[Any]:
         half = self.recipe.precision == 'bfloat16'
@@ -269,7 +269,7 @@ class Run:
         """Mean error on identities that training does not see, by rank 0; the best network so far is kept."""
         if self.rank:
             return {}
-        estimates, truths = estimate(self.averaged, self._validation, self.device)
+        estimates, truths = estimate(self.averaged.eval().predict, self._validation, self.device)
         errors = 1000 * (estimates - truths).norm(dim=-1)
         within = {f'val_within_{mm}': round(float((errors.amax(1) <= mm).float().mean()), 4) for mm in (20, 30, 40)}
         result = {'val_mm': round(float(errors.mean()), 3), **within}
@@ -302,4 +302,5 @@ class Run:
         self._saved = time.monotonic()
         if self.rank == 0:
             save_state(self.folder.state, self._modules(), self.optimizer,
-                       {'step': self.step, 'best_mm': self.best_mm if self.best_mm < float('inf') else None})
+                       {'step': self.step, 'finished': self.step >= self.steps,
+                        'best_mm': self.best_mm if self.best_mm < float('inf') else None})

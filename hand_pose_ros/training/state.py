@@ -36,6 +36,12 @@ def save_state(path: Path, modules: dict[str, nn.Module], optimizer: Optimizer, 
     save_tensors(path, {key: value.clone() for key, value in tensors.items()}, progress)
 
 
+def load_progress(path: Path) -> dict[str, Any]:
+    """The plain values alone."""
+    with safe_open(path, 'pt') as file:
+        return json.loads(file.metadata()['json'])
+
+
 def load_state(path: Path, modules: dict[str, nn.Module], optimizer: Optimizer) -> dict[str, Any]:
     """Read back into the same modules and optimiser; returns the plain values.
 

@@ -43,7 +43,7 @@ class SampleStream:
         self._stage: tuple[int, NDArray[np.int64]] | None = None
 
     def batch(self, step: int) -> tuple[Batch, torch.Tensor]:
-        """The samples of a step (patches as float32), and their numbers (B,) in the order of consumption."""
+        """The samples of a step (patches as float32), and for each its number (B,) in the order of consumption."""
         rank, world = self.part
         share = self.batch_size // world
         start = step * self.batch_size + rank * share
@@ -52,11 +52,11 @@ class SampleStream:
         while len(numbers):
             stage, offset, size = self._locate(int(numbers[0]))
             here = numbers[:size - offset]
-            parts += self._read(stage, offset, len(here), size)
+            parts += self._read(stage, size, offset, here)
             numbers = numbers[len(here):]
         batch = {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
         batch['patch'] = batch['patch'].float()
-        return batch, torch.arange(start, start + share)
+        return batch, batch.pop('number')
 
     def shards_used(self, step: int) -> int:
         """One past the last shard that the steps before this one have seen."""
@@ -81,14 +81,16 @@ class SampleStream:
         stage = next(s for s in range(k) if number < n * (s + 1) * (s + 2) // 2)
         return stage, number - n * stage * (stage + 1) // 2, n * (stage + 1)
 
-    def _read(self, stage: int, offset: int, count: int, size: int) -> Iterator[Batch]:
+    def _read(self, stage: int, size: int, offset: int, numbers: NDArray[np.int64]) -> Iterator[Batch]:
+        """The samples of these numbers, which have their places in the stage from `offset` on; shard by shard."""
         n, window = self.shards.shard_size, self.window(stage)
         if self._stage is None or self._stage[0] != stage:
             self._stage = stage, np.random.default_rng((self.seed, stage)).permutation(size)
             ahead = range(window.stop, window.stop + DiskShards.AHEAD) if self._window is None else ()
             self.shards.keep([*window, *ahead])
-        order = self._stage[1][offset:offset + count]
-        for shard in np.unique(order // n):
-            tensors = self.shards.read(window[int(shard)])
-            rows = torch.from_numpy(np.sort(order[order // n == shard] % n))
-            yield {key: value[rows.to(value.device)] for key, value in tensors.items()}
+        shards, rows = np.divmod(self._stage[1][offset:offset + len(numbers)], n)
+        for shard in np.unique(shards):
+            tensors, here = self.shards.read(window[int(shard)]), shards == shard
+            wanted = torch.from_numpy(rows[here])
+            yield {'number': torch.from_numpy(numbers[here]),
+                   **{key: value[wanted.to(value.device)] for key, value in tensors.items()}}

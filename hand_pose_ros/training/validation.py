@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import torch
 from torch import Tensor
 
 from hand_pose_ros.datasets import Batch, joints_in_metres
 from hand_pose_ros.datasets.shards import DiskShards, MemoryShards
-from hand_pose_ros.training.objectives import PoseObjective, RefinerObjective
 
 
 def first_samples(shards: DiskShards | MemoryShards, count: int) -> list[Batch]:
@@ -25,15 +24,18 @@ def first_samples(shards: DiskShards | MemoryShards, count: int) -> list[Batch]:
 
 
 @torch.no_grad()
-def estimate(objective: PoseObjective | RefinerObjective, batches: Iterable[Batch], device: torch.device,
+def estimate(predict: Callable[[Tensor], Tensor], batches: Iterable[Batch], device: torch.device,
              batch_size: int = 256) -> tuple[Tensor, Tensor]:
-    """Estimated and true joints (N, J, 3) in metres of the samples that show a hand."""
-    objective.eval()
+    """Estimated and true joints (N, J, 3) in metres of the samples that show a hand.
+
+    Args:
+        predict: patches (B, 1, 128, 128) -> joints (B, J, 3) in cube units.
+    """
     estimates, truths = [], []
     for whole in batches:
         for start in range(0, len(whole['patch']), batch_size):
             batch = {key: value[start:start + batch_size].to(device) for key, value in whole.items()}
             present, cube = batch['hand_present'], (batch['cube_center'], batch['cube_side'])
-            estimates.append(joints_in_metres(objective.predict(batch['patch'].float()).float(), *cube)[present].cpu())
+            estimates.append(joints_in_metres(predict(batch['patch'].float()).float(), *cube)[present].cpu())
             truths.append(joints_in_metres(batch['joints'], *cube)[present].cpu())
     return torch.cat(estimates), torch.cat(truths)

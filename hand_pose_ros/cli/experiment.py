@@ -1,0 +1,52 @@
+"""hand-pose experiment: repeat an experiment of the paper."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+EPILOG = """experiments:
+  networks      Shallow, Deep and Multi-Scale, each direct and with a bottleneck of 8 and 30, and DeepPrior++
+  bottleneck    width of the bottleneck against direct regression
+  refinement    none, StdRef and ORRef, and the number of iterations
+  joints        mean error of each joint
+  runtime       milliseconds per hand, beside the paper's
+  qualitative   estimates and truth on depth and on the point cloud from the side
+
+Each writes NAME.json, NAME.md, NAME.png and NAME.svg. Networks are trained with equal budgets into OUT/runs and shared
+by all experiments in OUT; an interrupted training goes on.
+
+examples:
+  hand-pose experiment bottleneck --out results --set samples=300_000
+  hand-pose experiment networks --out results-nyu --set dataset=nyu --set root=/data/NYU --set epochs=20
+"""
+
+
+def add_parser(subparsers: Any) -> None:
+    from hand_pose_ros.cli.train import add_machine_arguments
+
+    parser = subparsers.add_parser('experiment', help='repeat an experiment of the paper', epilog=EPILOG,
+                                   formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('name', choices=['networks', 'bottleneck', 'refinement', 'joints', 'runtime', 'qualitative'],
+                        metavar='NAME', help='see below')
+    parser.add_argument('--out', type=Path, required=True, metavar='OUT', help='folder of results and trained networks')
+    parser.add_argument('--recipe', default='paper', help='what all networks are trained by (default: %(default)s)')
+    add_machine_arguments(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    import logging
+
+    from tqdm.contrib.logging import logging_redirect_tqdm
+
+    from hand_pose_ros.cli.train import machine
+    from hand_pose_ros.training.experiments import EXPERIMENTS, Laboratory
+    from hand_pose_ros.training.recipes import get_recipe
+
+    logging.basicConfig(level=logging.INFO, format='%(message)s')
+    recipe = get_recipe(args.recipe, args.overrides)
+    args.out.mkdir(parents=True, exist_ok=True)
+    with logging_redirect_tqdm():
+        print(EXPERIMENTS[args.name](Laboratory(args.out, recipe, machine(args))))
+    return 0

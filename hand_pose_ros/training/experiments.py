@@ -1,0 +1,205 @@
+"""The experiments of the paper (section 4), each from one call: train what is missing, test, write the results.
+
+Networks are trained once and shared by all experiments of a folder; a training run that was interrupted goes on.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from torch import nn
+
+from hand_pose_ros.datasets import Batch, open_dataset
+from hand_pose_ros.datasets.shards import DiskShards
+from hand_pose_ros.errors import HandPoseError
+from hand_pose_ros.evaluation import plots
+from hand_pose_ros.evaluation.results import Result, write_atomically, write_json
+from hand_pose_ros.geometry import Intrinsics
+from hand_pose_ros.models import build
+from hand_pose_ros.models.checkpoints import Checkpoint, load_checkpoint
+from hand_pose_ros.skeleton import get_skeleton
+from hand_pose_ros.training import figures
+from hand_pose_ros.training.folder import RunFolder
+from hand_pose_ros.training.loop import Machine, Run
+from hand_pose_ros.training.recipes import Recipe
+from hand_pose_ros.training.state import load_progress
+from hand_pose_ros.training.validation import estimate, first_samples
+
+log = logging.getLogger(__name__)
+
+TEST_SAMPLES = 5000
+"""At most; of synthetic hands these are synthetic-test-v1."""
+WIDTHS = (None, 2, 4, 8, 16, 30)
+"""Of the bottleneck; None = direct regression."""
+ITERATIONS = 4
+
+PAPER_MS = {'shallow': (0.07, 1.85), 'deep': (0.10, 2.08), 'multi_scale': (0.81, 5.36), 'deep-30': (0.09, 2.29),
+            'deep-30 + or_ref': (2.38, 62.91)}
+"""Run times in the paper, of the network alone: GTX 780 Ti, and i7 CPU; refinement is told without its first stage."""
+
+_MIXED = Intrinsics(475.0, 475.0, 320.0, 240.0, 640, 480)
+
+
+@dataclass
+class Laboratory:
+    """Where experiments train and test.
+
+    Args:
+        folder: gets runs/NAME for each network, and the results.
+        recipe: what all networks have in common; an experiment changes the network alone, so budgets are equal.
+    """
+
+    folder: Path
+    recipe: Recipe
+    machine: Machine
+
+    def train(self, name: str, **changes: Any) -> Checkpoint:
+        """The trained network of this name; `changes` are those of its recipe."""
+        folder = RunFolder(self.folder / 'runs' / name)
+        recipe = dataclasses.replace(self.recipe, **changes)
+        started = folder.state.exists()
+        if started and folder.recipe() != recipe:
+            raise HandPoseError(f'{folder.path} was trained with another recipe; choose another --out, or delete it')
+        if not (started and folder.checkpoint('last').exists() and load_progress(folder.state)['finished']):
+            log.info('training %s', name)
+            Run(folder.path, recipe, self.machine).train(resume=started)
+        return load_checkpoint(folder.checkpoint('last'))
+
+    def network(self, architecture: str, width: int | None) -> Checkpoint:
+        return self.train(label(architecture, width), network=architecture, options={'bottleneck': width})
+
+    def refined(self, refiner: str) -> Checkpoint:
+        """Deep-Prior with this refiner."""
+        self.network('deep', 30)
+        base = RunFolder(self.folder / 'runs' / label('deep', 30)).checkpoint('last')
+        return self.train(f'deep-30-{refiner}', refiner=refiner, base=str(base))
+
+    @cached_property
+    def test(self) -> list[Batch]:
+        """The test samples."""
+        recipe, machine = self.recipe, self.machine
+        opening = partial(open_dataset, recipe.dataset, 'test', Path(recipe.root) if recipe.root else None)
+        return first_samples(DiskShards(opening, machine.cache, recipe.shard_size, max(1, machine.workers),
+                                        machine.limit_gb), TEST_SAMPLES)
+
+    def result(self, name: str, checkpoint: Checkpoint, iterations: int = 2) -> Result:
+        """What a network makes of the test samples, with the refiner of the checkpoint if it has one."""
+        network, refiner = checkpoint.network, checkpoint.refiner
+
+        def predict(patch: torch.Tensor) -> torch.Tensor:
+            joints = network(patch)
+            return refiner(patch, joints, iterations=iterations) if refiner is not None else joints
+
+        estimates, truths = estimate(predict, self.test, torch.device('cpu'))
+        skeleton = get_skeleton(checkpoint.metadata['skeleton'])
+        note = 'left hands are mirrored; crops as in training; cameras may be mixed: the intrinsics are nominal'
+        return Result(name, skeleton, _MIXED, estimates.double().numpy(), truths.double().numpy(), notes=(note,),
+                      info={'samples': checkpoint.metadata['samples'], 'dataset': self.recipe.dataset})
+
+    def write(self, name: str, table: str, values: dict[str, Any], figure: Figure) -> str:
+        """NAME.json, NAME.md, NAME.png and NAME.svg; returns the table."""
+        write_json({'recipe': dataclasses.asdict(self.recipe), **values}, self.folder / f'{name}.json')
+        write_atomically(self.folder / f'{name}.md', lambda file: file.write(table.encode()))
+        plots.save(figure, self.folder / name)
+        return table
+
+    def write_results(self, name: str, results: Sequence[Result], figure: Figure) -> str:
+        """The same for results of networks."""
+        return self.write(name, accuracy_table(results), {'results': [result.summary() for result in results]}, figure)
+
+
+def label(architecture: str, width: int | None) -> str:
+    """What a network is called in tables: deep-30, deep-direct."""
+    return f'{architecture}-{width or "direct"}'
+
+
+def accuracy_table(results: Sequence[Result]) -> str:
+    """Markdown: mean and median error, and the share of frames whose worst joint is within a distance."""
+    rows = ['| network | mean mm | median mm | <= 20 mm | <= 30 mm | <= 40 mm | <= 80 mm |', '|---' * 7 + '|']
+    for result in results:
+        s = result.summary()
+        within = ' | '.join(f'{100 * s["within_mm"][key]:.1f} %' for key in ('20', '30', '40', '80'))
+        rows.append(f'| {result.name} | {s["mean_mm"]:.2f} | {s["median_mm"]:.2f} | {within} |')
+    return '\n'.join(rows) + '\n'
+
+
+def networks(lab: Laboratory) -> str:
+    """Shallow, Deep, Multi-Scale, each direct and with bottlenecks of 8 and 30; and DeepPrior++."""
+    wanted = [(architecture, width) for architecture in ('shallow', 'deep', 'multi_scale') for width in (None, 8, 30)]
+    results = [lab.result(label(*which), lab.network(*which)) for which in [*wanted, ('resnet', 30)]]
+    best = sorted(results, key=lambda result: float(np.mean(result.errors_mm)))[:8]
+    return lab.write_results('networks', results, plots.curves(best))
+
+
+def bottleneck(lab: Laboratory) -> str:
+    """Width of the bottleneck of the Deep network, against direct regression (the paper's left figures)."""
+    results = [lab.result(label('deep', width), lab.network('deep', width)) for width in WIDTHS]
+    lab.write_results('bottleneck-curves', results, plots.curves(results))
+    return lab.write_results('bottleneck', results, figures.bottleneck(results, WIDTHS))
+
+
+def refinement(lab: Laboratory) -> str:
+    """No refinement, StdRef and ORRef, and the number of iterations (the paper's right figures)."""
+    results = [lab.result('deep-30', lab.network('deep', 30))]
+    for refiner in ('std_ref', 'or_ref'):
+        checkpoint = lab.refined(refiner)
+        results += [lab.result(f'deep-30 + {refiner} x{i}', checkpoint, i) for i in range(1, ITERATIONS + 1)]
+    twice = [results[0], *(result for result in results if result.name.endswith('x2'))]
+    lab.write_results('refinement-curves', twice, plots.curves(twice))
+    return lab.write_results('refinement', results, figures.iterations(results))
+
+
+def joints(lab: Laboratory) -> str:
+    """Mean error of each joint, direct, with the prior, and refined (two iterations)."""
+    results = [lab.result('deep-direct', lab.network('deep', None)), lab.result('deep-30', lab.network('deep', 30)),
+               lab.result('deep-30 + or_ref x2', lab.refined('or_ref'))]
+    return lab.write_results('joints', results, plots.joint_bars(results))
+
+
+def qualitative(lab: Laboratory) -> str:
+    """Estimate and truth on the depth image and on the point cloud from another angle, from good to bad."""
+    result = lab.result('deep-30', lab.network('deep', 30))
+    order = np.argsort(result.errors_mm.mean(1))
+    ranks = [int(share * (len(order) - 1)) for share in (0.05, 0.25, 0.5, 0.75, 0.95)]
+    figure = figures.qualitative(result, lab.test, order[ranks])
+    return lab.write_results('qualitative', [result], figure)
+
+
+def runtime(lab: Laboratory) -> str:
+    """Milliseconds for one hand on this machine, beside the paper's; random weights take as long as trained ones."""
+    from hand_pose_ros.cli.bench import measure
+    from hand_pose_ros.runtime import make_engine
+    from hand_pose_ros.runtime.engine import Pipeline, TorchEngine
+
+    def made(name: str) -> tuple[nn.Module, nn.Module | None]:
+        first, _, refiner = name.partition(' + ')
+        architecture, _, width = first.partition('-')
+        return (build(architecture, bottleneck=int(width) if width else None),
+                build(refiner) if refiner else None)
+
+    patch = lab.test[0]['patch'][:1].float().numpy()
+    calls: dict[str, Callable[[], Any]] = {}
+    for name in PAPER_MS:
+        network, refiner = made(name)
+        calls[f'{name}|eager'] = partial(TorchEngine(Pipeline(network, refiner).eval()).run, patch)
+        calls[f'{name}|fast'] = partial(make_engine(network, 'cpu', refiner=refiner).run, patch)
+    rows = measure(calls, rounds=10)
+    table = ['| network | paper GPU | paper CPU | here, PyTorch | here, fastest engine |', '|---|---|---|---|---|']
+    for name, (gpu, cpu) in PAPER_MS.items():
+        table.append(f'| {name} | {gpu} | {cpu} | {rows[f"{name}|eager"]["p50_ms"]:.2f} | '
+                     f'{rows[f"{name}|fast"]["p50_ms"]:.2f} |')
+    text = 'Median milliseconds for one hand.\n\n' + '\n'.join(table) + '\n'
+    return lab.write('runtime', text, {'rows': rows, 'paper_ms': PAPER_MS}, figures.runtime(rows, PAPER_MS))
+
+
+EXPERIMENTS: dict[str, Callable[[Laboratory], str]] = {
+    experiment.__name__: experiment for experiment in (networks, bottleneck, refinement, joints, runtime, qualitative)}

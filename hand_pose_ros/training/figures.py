@@ -1,0 +1,122 @@
+"""The figures of the experiments; each returns a matplotlib Figure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import matplotlib
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from hand_pose_ros.datasets import Batch, joints_in_metres
+from hand_pose_ros.evaluation import metrics
+from hand_pose_ros.evaluation.plots import COLORS, STYLE
+from hand_pose_ros.evaluation.results import Result
+
+ESTIMATE, TRUTH = COLORS[0], COLORS[1]
+
+
+@matplotlib.rc_context(STYLE)
+def bottleneck(results: Sequence[Result], widths: Sequence[int | None]) -> Figure:
+    """Mean error, and frames within 30 mm, over the width of the bottleneck; direct regression as a line."""
+    figure = Figure((9, 3.6), layout='constrained')
+    for axes, title, score in zip(
+            figure.subplots(1, 2), ('Mean error, mm', 'Frames with all joints within 30 mm, %'),
+            (lambda r: metrics.mean_mm(r.errors_mm), lambda r: 100 * metrics.success_curve(r.errors_mm, [30])[0]),
+            strict=True):
+        points = {width: score(result) for width, result in zip(widths, results, strict=True)}
+        with_prior = {width: value for width, value in points.items() if width is not None}
+        axes.axhline(points[None], color=COLORS[1], ls='--', label='direct')
+        axes.plot(list(with_prior), list(with_prior.values()), 'o-', color=COLORS[0], label='through the prior')
+        axes.set(title=title, xlabel='width of the bottleneck', xticks=list(with_prior))
+        axes.legend(fontsize=9)
+    return figure
+
+
+@matplotlib.rc_context(STYLE)
+def iterations(results: Sequence[Result]) -> Figure:
+    """Mean error over the number of refinements; the first result is without any, the others are called 'NAME xN'."""
+    figure = Figure((5.5, 3.8), layout='constrained')
+    axes = figure.subplots()
+    names = dict.fromkeys(result.name.rpartition(' x')[0] for result in results[1:])
+    for name, color in zip(names, COLORS, strict=False):
+        chain = [results[0], *(result for result in results[1:] if result.name.rpartition(' x')[0] == name)]
+        means = [metrics.mean_mm(result.errors_mm) for result in chain]
+        axes.plot(range(len(chain)), means, 'o-', color=color, label=name)
+    axes.set(title='Mean error, mm', xlabel='iterations of the refinement')
+    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.legend(fontsize=9)
+    return figure
+
+
+@matplotlib.rc_context(STYLE)
+def runtime(rows: Mapping[str, Mapping[str, float]], paper_ms: Mapping[str, tuple[float, float]]) -> Figure:
+    """Milliseconds by network, here and in the paper (logarithmic); `rows` are called 'NAME|eager' and 'NAME|fast'."""
+    figure = Figure((7.5, 3.6), layout='constrained')
+    axes = figure.subplots()
+    at = np.arange(len(paper_ms))
+    bars = {'paper, CPU': [cpu for _, cpu in paper_ms.values()],
+            'here, PyTorch': [rows[f'{name}|eager']['p50_ms'] for name in paper_ms],
+            'here, fastest': [rows[f'{name}|fast']['p50_ms'] for name in paper_ms]}
+    for k, (name, values) in enumerate(bars.items()):
+        axes.bar(at + (k - 1) * 0.27, values, 0.25, color=COLORS[k], label=name)
+    axes.set_yscale('log')
+    axes.set_xticks(at, list(paper_ms))
+    axes.set(title='Time for one hand, ms')
+    axes.legend(fontsize=9)
+    return figure
+
+
+@matplotlib.rc_context(STYLE)
+def qualitative(result: Result, batches: Sequence[Batch], rows: NDArray[np.int64]) -> Figure:
+    """A column per frame: the patch, and its points from the side, with estimate and truth."""
+    present = torch.cat([batch['hand_present'] for batch in batches]).nonzero()[:, 0]
+    whole = {key: torch.cat([batch[key] for batch in batches]) for key in ('cube_center', 'cube_side')}
+    figure = Figure((2.7 * len(rows), 5.8), layout='constrained')
+    for column, axes in zip(rows, figure.subplots(2, len(rows)).T, strict=True):
+        number = int(present[column])
+        center, side = whole['cube_center'][number], whole['cube_side'][number]
+        patch = _patch(batches, number)
+        assert result.truth is not None
+        skeletons = [(result.truth[column], TRUTH, 'truth'), (result.predictions[column], ESTIMATE, 'estimate')]
+        cloud = _points(patch, center, side)
+        for view, turn in zip(axes, (0.0, 70.0), strict=True):
+            seen = _turned(cloud, center, turn)
+            view.scatter(seen[:, 0], seen[:, 1], c=cloud[:, 2], s=1.5, cmap='Greys_r', linewidths=0,
+                         vmax=float(center[2] + side))
+            for joints, color, name in skeletons:
+                flat = _turned(torch.from_numpy(joints).float(), center, turn)
+                for parent, child in result.skeleton.bones:
+                    view.plot(*flat[[parent, child]].T, color=color, lw=1.4, alpha=0.9, label=name)
+                    name = None
+            reach = float(side) / 2
+            view.set(xlim=(-reach, reach), ylim=(reach, -reach), aspect='equal', xticks=[], yticks=[])
+        axes[0].set_title(f'{result.errors_mm[column].mean():.0f} mm')
+        axes[1].set_title('from the side', fontsize=9)
+    figure.axes[0].legend(fontsize=8, loc='lower left')
+    return figure
+
+
+def _patch(batches: Sequence[Batch], number: int) -> torch.Tensor:
+    for batch in batches:
+        if number < len(batch['patch']):
+            return batch['patch'][number, 0].float()
+        number -= len(batch['patch'])
+    raise IndexError(number)
+
+
+def _points(patch: torch.Tensor, center: torch.Tensor, side: torch.Tensor) -> torch.Tensor:
+    """The readings of a patch as points (N, 3) in metres."""
+    rows, columns = (patch < 1).nonzero(as_tuple=True)
+    scale = 2 / patch.shape[0]
+    units = torch.stack([(columns + 0.5) * scale - 1, (rows + 0.5) * scale - 1, patch[rows, columns]], dim=1)
+    return joints_in_metres(units[None], center[None], side[None])[0]
+
+
+def _turned(points: torch.Tensor, center: torch.Tensor, degrees: float) -> NDArray[np.float32]:
+    """(N, 2): x and y relative to the centre after a turn about the vertical through it."""
+    x, y, z = (points - center).unbind(1)
+    angle = np.radians(degrees)
+    return torch.stack([x * np.cos(angle) + z * np.sin(angle), y], dim=1).numpy()

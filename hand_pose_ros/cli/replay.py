@@ -51,10 +51,12 @@ def run(args: argparse.Namespace) -> int:
     if args.start < 0:
         args.parser.error(f'--start {args.start}: must not be negative')
     from hand_pose_ros.bags import Bag
+    from hand_pose_ros.ros.qos import let_large_images_through
     from hand_pose_ros.ros.replay import Replay  # says what is missing where there is no ROS
     import rclpy  # isort: skip
     from rclpy.signals import SignalHandlerOptions  # isort: skip
 
+    let_large_images_through()
     # Without handlers of rclpy, Ctrl-C arrives here, between two messages, as a KeyboardInterrupt.
     rclpy.init(args=['--ros-args', *args.ros_args], signal_handler_options=SignalHandlerOptions.NO)
     try:

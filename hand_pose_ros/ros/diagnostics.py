@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections import Counter, defaultdict
@@ -11,8 +12,14 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from numpy.typing import NDArray
 
+from hand_pose_ros.ros.topics import remedy_for_lost_images
+
 MAX_DROPPED = 0.2
-"""A larger share of dropped images is worth a warning."""
+"""A larger share of dropped or lost images is worth a warning."""
+MIN_SAMPLE = 10
+"""Fewer than this in a second tell nothing about shares."""
+REPEAT_S = 30.0
+"""The same complaint is logged again after so long."""
 MAX_OUTSIDE = 0.99
 """With so much of the depth out of range not even a hand is left."""
 
@@ -28,12 +35,18 @@ class _Window:
 
 
 class Statistics:
-    """Counts images (received, dropped, lost, refused, answered) and times; safe to use from several threads."""
+    """Counts (received, dropped, refused, answered; camera_infos, hands) and times; for use from several threads.
+
+    Attributes:
+        failure: why the node could not do as it was told, empty if it could.
+    """
 
     def __init__(self) -> None:
+        self.failure = ''
         self._lock = threading.Lock()
         self._window = _Window()
         self._totals: Counter[str] = Counter()
+        self._logged_at: dict[str, float] = {}
 
     def count(self, what: str, n: int = 1) -> None:
         """Add to one of the counts."""
@@ -52,28 +65,38 @@ class Statistics:
         with self._lock:
             self._window.problem = text
 
-    def report(self, node: str, state: str, facts: dict[str, str]) -> DiagnosticStatus:
+    def is_news(self, problem: str) -> bool:
+        """Whether a problem should be logged: once, and again after a while; numbers do not make it another problem."""
+        kind, now = re.sub(r'\d+', '#', problem), time.monotonic()
+        with self._lock:
+            if now - self._logged_at.get(kind, -REPEAT_S) < REPEAT_S:
+                return False
+            self._logged_at[kind] = now
+            return True
+
+    def report(self, node: str, state: str, engine: str, model: str) -> DiagnosticStatus:
         """The status of the time since the last report, which begins a new one.
 
         Args:
             node: its name.
             state: of the lifecycle, e.g. `active`.
-            facts: more keys and values, e.g. the model.
+            engine: what runs the network.
+            model: name or path of its weights.
         """
         with self._lock:
             window, self._window = self._window, _Window()
             totals = dict(self._totals)
         elapsed = time.perf_counter() - window.since
         counts = window.counts
-        level, message = _judge(window, state)
+        level, message = (DiagnosticStatus.ERROR, self.failure) if self.failure else _judge(window, state)
         values = {'state': state, 'input_hz': f'{counts["received"] / elapsed:.1f}',
                   'output_hz': f'{counts["answered"] / elapsed:.1f}'}
         for stage, seconds in window.seconds.items():
             values[f'{stage}_p50_ms'] = f'{np.percentile(seconds, 50) * 1e3:.2f}'
             values[f'{stage}_p95_ms'] = f'{np.percentile(seconds, 95) * 1e3:.2f}'
         values |= {f'{what}_total': str(totals.get(what, 0))
-                   for what in ('received', 'dropped', 'lost', 'refused', 'answered', 'hands')}
-        values |= facts
+                   for what in ('received', 'dropped', 'refused', 'answered', 'hands')}
+        values |= {'engine': engine, 'model': model}
         return DiagnosticStatus(level=level, name=f'{node}: hand pose', message=message,
                                 values=[KeyValue(key=key, value=value) for key, value in values.items()])
 
@@ -81,18 +104,18 @@ class Statistics:
 def _judge(window: _Window, state: str) -> tuple[bytes, str]:
     """Level and message: the worst that happened."""
     counts = window.counts
-    if state != 'active':
-        return DiagnosticStatus.WARN, window.problem or f'the node is {state}'
     if window.problem:
         return DiagnosticStatus.WARN, window.problem
+    if state != 'active':
+        return DiagnosticStatus.OK, f'the node is {state}'
+    if counts['camera_infos'] >= MIN_SAMPLE and counts['received'] < (1 - MAX_DROPPED) * counts['camera_infos']:
+        return DiagnosticStatus.WARN, (f'{counts["camera_infos"]} camera_info but only {counts["received"]} images '
+                                       f'arrived in a second: if there should be as many, {remedy_for_lost_images()}')
     if counts['received'] == 0:
         return DiagnosticStatus.STALE, 'no images'
-    if counts['lost']:
-        return DiagnosticStatus.WARN, (f'{counts["lost"]} images were lost on the way: for large images set the Fast '
-                                       'DDS profile of this package where the camera runs')
-    if counts['dropped'] > MAX_DROPPED * counts['received']:
-        return DiagnosticStatus.WARN, (f'{counts["dropped"]} of {counts["received"]} images were dropped: this machine '
-                                       'is too slow for their rate')
+    if counts['received'] >= MIN_SAMPLE and counts['dropped'] > MAX_DROPPED * counts['received']:
+        return DiagnosticStatus.WARN, (f'{counts["dropped"]} of {counts["received"]} images of a second were dropped: '
+                                       'this machine is too slow, or too busy, for their rate')
     return DiagnosticStatus.OK, f'{counts["answered"]} images answered, {counts["hands"]} hands'
 
 

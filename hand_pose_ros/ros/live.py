@@ -73,6 +73,7 @@ def play_through_node(bag: DepthBag, camera_info_topic: str | None = None,
     remappings = {'__ns': namespace, IMAGE: image, CAMERA_INFO: camera_info_topic or beside}
     arguments += [item for name, topic in remappings.items() for item in ('-r', f'{name}:={topic}')]
     if ours := not rclpy.ok():
+        qos.let_large_images_through()
         rclpy.init()
     try:
         with _listening(namespace, bag.depth_topic, Image if transport == 'raw' else CompressedImage) as listener, \

@@ -6,7 +6,6 @@ Callbacks only store and signal. One worker thread takes the newest image throug
 from __future__ import annotations
 
 import gc
-import re
 import sys
 import time
 import traceback
@@ -14,7 +13,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -43,8 +42,6 @@ from hand_pose_ros.ros.worker import NewestWorker
 
 SILENCE_S = 5.0
 """Images that stay away for so long are worth a warning."""
-REPEAT_S = 30.0
-"""The same complaint is logged again after so long."""
 
 Transition = Callable[['EstimatorNode', LifecycleState], TransitionCallbackReturn]
 
@@ -52,14 +49,16 @@ Transition = Callable[['EstimatorNode', LifecycleState], TransitionCallbackRetur
 def _logged(transition: Transition) -> Transition:
     """Say why a transition failed: rclpy itself swallows exceptions."""
     def wrapper(self: EstimatorNode, state: LifecycleState) -> TransitionCallbackReturn:
+        self._statistics.failure = ''
         try:
             return transition(self, state)
         except HandPoseError as error:
-            self.get_logger().error(str(error))
-            return TransitionCallbackReturn.FAILURE
+            result, self._statistics.failure = TransitionCallbackReturn.FAILURE, str(error)
         except Exception:
-            self.get_logger().error(f'unexpected error in a transition from {state.label}:\n{traceback.format_exc()}')
-            return TransitionCallbackReturn.ERROR
+            result = TransitionCallbackReturn.ERROR
+            self._statistics.failure = f'unexpected error, please report it:\n{traceback.format_exc()}'
+        self.get_logger().error(self._statistics.failure)
+        return result
     return wrapper
 
 
@@ -68,7 +67,6 @@ class EstimatorNode(LifecycleNode):
 
     def __init__(self, **kwargs: Any) -> None:
         self._statistics = Statistics()
-        self._complained: dict[str, float] = {}
         self._estimator: HandPoseEstimator | None = None
         self._worker: NewestWorker[Image | CompressedImage] | None = None
         self._inputs: list[Subscription] = []
@@ -155,7 +153,7 @@ class EstimatorNode(LifecycleNode):
         self._camera = Camera(info_topic)
         self._last_header = Header()
         self._heard_at, self._silent = time.monotonic(), False
-        self._inputs.append(self._subscribe(CameraInfo, info_topic, self._camera.update))
+        self._inputs.append(self._subscribe(CameraInfo, info_topic, self._on_camera_info))
         self._inputs.append(self._subscribe(image_type, image_topic, self._on_image))
         self._image_topic = self._inputs[1].topic_name
         self._worker = NewestWorker(self._answer)
@@ -189,6 +187,10 @@ class EstimatorNode(LifecycleNode):
         if self._worker.put(image):
             self._statistics.count('dropped')
 
+    def _on_camera_info(self, info: CameraInfo) -> None:
+        self._statistics.count('camera_infos')
+        self._camera.update(info)
+
     def _on_parameters(self, changes: Sequence[Parameter]) -> SetParametersResult:
         try:
             self._params = parameters.changed(self._params, changes, configured=self._estimator is not None)
@@ -218,28 +220,25 @@ class EstimatorNode(LifecycleNode):
             self._silent = True
             kind = 'Image' if self._params.transport == 'raw' else 'CompressedImage'
             self._complain(topics.explain_silence(self, self._image_topic, f'sensor_msgs/msg/{kind}', quiet))
+        engine = self._estimator.engine.name if self._estimator is not None else 'none'
+        status = self._statistics.report(self.get_name(), self._state, engine, self._params.model or 'default')
+        if status.level == DiagnosticStatus.WARN:
+            self._say(status.message)
         if self._params.publish_diagnostics:
-            message = DiagnosticArray(status=[self._statistics.report(self.get_name(), self._state, self._facts())])
-            message.header.stamp = self.get_clock().now().to_msg()
-            self._diagnostics.publish(message)
+            now = Header(stamp=self.get_clock().now().to_msg())
+            self._diagnostics.publish(DiagnosticArray(header=now, status=[status]))
 
     @property
     def _state(self) -> str:
         state = self._state_machine.current_state[1]
         return 'disabled' if state == 'active' and self._worker is None else state
 
-    def _facts(self) -> dict[str, str]:
-        if self._estimator is None:
-            return {}
-        return {'engine': self._estimator.engine.name, 'skeleton': self._estimator.skeleton.name,
-                'model': self._params.model or 'default'}
-
     def _complain(self, problem: str) -> None:
-        """Log a problem once, and not again for a while; numbers do not make it another problem."""
         self._statistics.problem(problem)
-        kind, now = re.sub(r'\d+', '#', problem), time.monotonic()
-        if now - self._complained.get(kind, -REPEAT_S) >= REPEAT_S:
-            self._complained[kind] = now
+        self._say(problem)
+
+    def _say(self, problem: str) -> None:
+        if self._statistics.is_news(problem):
             self.get_logger().warning(problem)
 
     # The worker

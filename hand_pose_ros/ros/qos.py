@@ -1,6 +1,8 @@
-"""Quality of service: what the topics ask for and offer."""
+"""Quality of service: what the topics ask for and offer, and how large images get through."""
 
 from __future__ import annotations
+
+import os
 
 from rclpy.qos import (
     QoSDurabilityPolicy,
@@ -10,6 +12,8 @@ from rclpy.qos import (
     qos_policy_name_from_kind,
 )
 from rclpy.qos_overriding_options import QoSOverridingOptions
+
+from hand_pose_ros.resources import resource
 
 RESULTS = QoSProfile(history=QoSHistoryPolicy.KEEP_LAST, depth=10, reliability=QoSReliabilityPolicy.RELIABLE)
 """Out: reliable connects to every subscriber."""
@@ -34,3 +38,22 @@ def overriding_options() -> QoSOverridingOptions:
 def policy_name(kind: int) -> str:
     """The policy that an event is about, as parameters spell it, e.g. `reliability`."""
     return str(qos_policy_name_from_kind(kind)).lower()
+
+
+_PROFILE_VARIABLES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')  # the second up to Jazzy
+
+
+def large_image_profile() -> tuple[str, str]:
+    """The environment variable, and the file that it must name, for large images over Fast DDS.
+
+    Only who publishes images needs it: the shared memory that an image must fit into is the publisher's. Without it a
+    VGA depth image is larger than all of it, and most are lost on the way to a best-effort subscriber.
+    """
+    name = _PROFILE_VARIABLES[os.environ.get('ROS_DISTRO') in ('humble', 'iron', 'jazzy')]
+    return name, str(resource('config/fastdds_large_images.xml'))
+
+
+def let_large_images_through() -> None:
+    """Choose that profile for this process, unless the user has chosen one; call it before rclpy.init()."""
+    if not any(name in os.environ for name in _PROFILE_VARIABLES):
+        os.environ.update([large_image_profile()])

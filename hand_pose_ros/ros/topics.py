@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from rclpy.node import Node
 
+from hand_pose_ros.ros.qos import large_image_profile
+
 IMAGE, CAMERA_INFO = 'depth/image_rect', 'depth/camera_info'
 
 
@@ -44,8 +46,12 @@ def explain_silence(node: Node, topic: str, topic_type: str, seconds: float) -> 
         return f'{said}{where}: start the camera, or name its topic with --ros-args -r {IMAGE}:=/its/topic'
     if all(info.topic_type != topic_type for info in infos):
         return f'{said}, but {topic_type} is expected: remap {IMAGE}, or set the parameter transport'
-    return (f'{said}: if it does publish, set the Fast DDS profile for large images where it runs, or ask for what it '
-            f'offers with the parameter qos_overrides.{topic}.subscription.reliability')
+    return f'{said}: if it does publish, {remedy_for_lost_images()}'
+
+
+def remedy_for_lost_images() -> str:
+    """What to do where large images do not get through."""
+    return f'start the camera driver with {"=".join(large_image_profile())} in its environment (Fast DDS)'
 
 
 def explain_incompatible(node: Node, topic: str, policy: str) -> str:

@@ -20,6 +20,8 @@ MIN_SAMPLE = 10
 """Fewer than this in a second tell nothing about shares."""
 REPEAT_S = 30.0
 """The same complaint is logged again after so long."""
+MAX_KINDS = 100
+"""So many different complaints are remembered."""
 MAX_OUTSIDE = 0.99
 """With so much of the depth out of range not even a hand is left."""
 
@@ -71,6 +73,8 @@ class Statistics:
         with self._lock:
             if now - self._logged_at.get(kind, -REPEAT_S) < REPEAT_S:
                 return False
+            if len(self._logged_at) >= MAX_KINDS:
+                self._logged_at.clear()
             self._logged_at[kind] = now
             return True
 

@@ -182,7 +182,8 @@ def _figures(scored: Sequence[Result], result: Result) -> dict[str, Figure]:
 
 def _tiles(summary: dict[str, Any]) -> str:
     within = summary.get('within_mm', {})
-    latency = summary.get('latency_ms', {}).get('total', {})
+    stages = summary.get('latency_ms', {})
+    latency = stages.get('total') or stages.get('image to joints', {})  # the live node tells no stages
     tiles = [
         ('mean error', number(summary.get('mean_mm'), 1, ' mm')),
         ('median of joints', number(summary.get('median_mm'), 1, ' mm')),

@@ -23,6 +23,7 @@ from hand_pose_ros.models import build
 from hand_pose_ros.models.checkpoints import load_checkpoint
 from hand_pose_ros.models.prior import fit_prior
 from hand_pose_ros.skeleton import HAND21
+from hand_pose_ros.training import experiments
 from hand_pose_ros.training.augmentation import PRESETS, Augmentation, augment
 from hand_pose_ros.training.folder import TrainingError
 from hand_pose_ros.training.loop import Machine, Run
@@ -38,12 +39,13 @@ TINY = ('dataset=icvl', 'network=shallow', 'options.bottleneck=8', 'batch_size=4
 
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory) -> Path:
-    """A small dataset in ICVL's format: five balls around a sixth, which are the joints; and a cache."""
+    """A small dataset in ICVL's format, whose joints are discs in space."""
     root = tmp_path_factory.mktemp('icvl')
     rng = np.random.default_rng(0)
     lines = []
-    for i in range(20):
-        name = f'{"201403121135" if i < 16 else "201405151126"}/image_{i:04d}.png'
+    for i in range(26):
+        sequence = '201403121135' if i < 16 else '201405151126' if i < 20 else 'test_seq_1' if i < 23 else 'test_seq_2'
+        name = f'{sequence}/image_{i:04d}.png'
         joints = np.array([0, 0, 0.4]) + rng.uniform(-0.06, 0.06, (16, 3))
         v, u = np.mgrid[:240, :320]
         depth = np.zeros((240, 320))
@@ -55,7 +57,8 @@ def folder(tmp_path_factory) -> Path:
         uv = icvl.INTRINSICS.project(joints)
         lines.append(name + ''.join(f' {a:.4f} {b:.4f} {1000 * z:.4f}' for (a, b), z in
                                     zip(uv, joints[:, 2], strict=True)))
-    (root / 'labels.txt').write_text('\n'.join(lines))
+    for file, part in (('labels', slice(20)), ('test_seq_1', slice(20, 23)), ('test_seq_2', slice(23, 26))):
+        (root / f'{file}.txt').write_text('\n'.join(lines[part]))
     return root
 
 
@@ -432,6 +435,29 @@ def test_the_heads_of_a_dense_network_are_trained_for_what_they_say():
     assert all(after[key] < before[key] for key in after)
     changed = {**batch, 'joints': torch.where(torch.tensor([0, 0, 1, 1])[:, None, None] > 0, 9.0, batch['joints'])}
     assert {key: float(value) for key, value in objective(changed).items()} == after
+
+
+def test_experiments_train_what_is_missing_and_write_table_plot_and_json(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(experiments, 'WIDTHS', (None, 8, 30))
+    monkeypatch.setattr(experiments, 'ITERATIONS', 2)
+    monkeypatch.setattr(experiments, 'ROUNDS', 1)
+    sets = [part for item in (*TINY, f'root={folder}', 'samples=24', 'last_shard=3') for part in ('--set', item)]
+    arguments = ['--out', str(tmp_path), '--workers', '0', '--threads', '1', *sets]
+    for name in ('bottleneck', 'refinement', 'joints', 'qualitative', 'runtime'):
+        assert main(['experiment', name, *arguments]) == 0
+        assert json.loads((tmp_path / f'{name}.json').read_text())['recipe']['samples'] == 24
+        assert cv2.imread(str(tmp_path / f'{name}.png')).std() > 5
+        assert (tmp_path / f'{name}.md').read_text().count('|') > 20
+    runs = {path.name: (path / 'state.safetensors').stat().st_mtime_ns for path in (tmp_path / 'runs').iterdir()}
+    assert runs.keys() == {'deep-direct', 'deep-8', 'deep-30', 'deep-30-std_ref', 'deep-30-or_ref'}
+    results = json.loads((tmp_path / 'refinement.json').read_text())['results']
+    assert [result['name'] for result in results] == [
+        'deep-30', 'deep-30 + std_ref x1', 'deep-30 + std_ref x2', 'deep-30 + or_ref x1', 'deep-30 + or_ref x2']
+    assert len({result['mean_mm'] for result in results}) == 5 and all(result['frames'] == 6 for result in results)
+
+    assert main(['experiment', 'bottleneck', *arguments]) == 0  # again: nothing is trained twice
+    assert all((tmp_path / 'runs' / run / 'state.safetensors').stat().st_mtime_ns == at for run, at in runs.items())
+    assert main(['experiment', 'bottleneck', *arguments, '--set', 'knee=0.2']) == 1  # but never another recipe
 
 
 def test_command_line(tmp_path, folder, capsys):

@@ -13,7 +13,7 @@ EPILOG = """examples:
   hand-pose train paper --out runs/orref --set refiner=or_ref --set base=runs/deep-prior/best.safetensors
   hand-pose train paper --out runs/nyu --set dataset=nyu --set root=/data/NYU
   hand-pose train --out runs/modern --resume
-  torchrun --standalone --nproc-per-node 4 --no-python hand-pose train modern --out runs/modern --device cuda --workers 0
+  torchrun --standalone --nproc-per-node 4 --no-python hand-pose train modern --out runs/m --device cuda --workers 0
 
 recipes: paper, original-code, modern; docs/training.md says what they do and lists every value.
 """

@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -137,7 +138,7 @@ def require(dataset: str, paths: Iterable[Path]) -> None:
                            'the folder described in docs/training.md?')
 
 
-def read_depth(path: Path, dataset: str, channels: int = 1) -> NDArray[np.uint16]:
+def read_depth(path: Path, dataset: str, channels: int = 1) -> NDArray[Any]:
     """A depth PNG as it is stored, (H, W) uint16 or, with 3 channels, (H, W, 3) uint8 blue, green, red.
 
     Raises:

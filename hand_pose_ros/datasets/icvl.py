@@ -54,7 +54,7 @@ class ICVL(RecordedDataset):
 
     def frame(self, index: int) -> LabelledFrame:
         path, uvd = self._frames[index]
-        depth = read_depth(self._depth / path, 'ICVL').astype(np.float32) / 1000
+        depth = (read_depth(self._depth / path, 'ICVL') / 1000).astype(np.float32)
         joints = INTRINSICS.back_project(uvd[:, :2], uvd[:, 2] / 1000)
         return LabelledFrame(depth, INTRINSICS, joints, joints[PALM], CUBE_SIDE)
 

@@ -150,7 +150,7 @@ def _checksum(tensors: Batch) -> str:
     digest = hashlib.sha256()
     for key in sorted(tensors):
         digest.update(f'{key}{tuple(tensors[key].shape)}'.encode())
-        digest.update(memoryview(tensors[key].contiguous().reshape(-1).view(torch.uint8).numpy()))
+        digest.update(tensors[key].contiguous().reshape(-1).view(torch.uint8).numpy().data)
     return digest.hexdigest()
 
 
@@ -162,7 +162,8 @@ def _start_worker(open_dataset: Callable[[], Dataset], shard_size: int, root: Pa
     global _worker
     torch.set_num_threads(1)
     keep_freed_memory()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the training run decides when to stop
+    for number in (signal.SIGINT, signal.SIGTERM):  # the training run decides when to stop
+        signal.signal(number, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None
 

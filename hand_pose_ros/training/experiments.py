@@ -18,8 +18,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import nn
 
-from hand_pose_ros.datasets import Batch, open_dataset
-from hand_pose_ros.datasets.shards import DiskShards
+from hand_pose_ros.datasets import Batch
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.evaluation import plots
 from hand_pose_ros.evaluation.results import Result, write_atomically, write_json
@@ -29,7 +28,7 @@ from hand_pose_ros.models.checkpoints import Checkpoint, load_checkpoint
 from hand_pose_ros.skeleton import get_skeleton
 from hand_pose_ros.training import figures
 from hand_pose_ros.training.folder import RunFolder
-from hand_pose_ros.training.loop import Machine, Run
+from hand_pose_ros.training.loop import Machine, Run, open_shards
 from hand_pose_ros.training.recipes import Recipe
 from hand_pose_ros.training.state import load_progress
 from hand_pose_ros.training.validation import estimate, first_samples
@@ -41,6 +40,8 @@ TEST_SAMPLES = 5000
 WIDTHS = (None, 2, 4, 8, 16, 30)
 """Of the bottleneck; None = direct regression."""
 ITERATIONS = 4
+ROUNDS = 10
+"""Of timing, 10 calls each."""
 
 PAPER_MS = {'shallow': (0.07, 1.85), 'deep': (0.10, 2.08), 'multi_scale': (0.81, 5.36), 'deep-30': (0.09, 2.29),
             'deep-30 + or_ref': (2.38, 62.91)}
@@ -78,18 +79,15 @@ class Laboratory:
         return self.train(label(architecture, width), network=architecture, options={'bottleneck': width})
 
     def refined(self, refiner: str) -> Checkpoint:
-        """Deep-Prior with this refiner."""
+        """Deep-Prior with this refiner, which is trained on what lies behind the training data of Deep-Prior."""
         self.network('deep', 30)
         base = RunFolder(self.folder / 'runs' / label('deep', 30)).checkpoint('last')
-        return self.train(f'deep-30-{refiner}', refiner=refiner, base=str(base))
+        return self.train(f'deep-30-{refiner}', refiner=refiner, base=str(base), last_shard=None)
 
     @cached_property
     def test(self) -> list[Batch]:
         """The test samples."""
-        recipe, machine = self.recipe, self.machine
-        opening = partial(open_dataset, recipe.dataset, 'test', Path(recipe.root) if recipe.root else None)
-        return first_samples(DiskShards(opening, machine.cache, recipe.shard_size, max(1, machine.workers),
-                                        machine.limit_gb), TEST_SAMPLES)
+        return first_samples(open_shards(self.recipe, self.machine, 'test', torch.device('cpu')), TEST_SAMPLES)
 
     def result(self, name: str, checkpoint: Checkpoint, iterations: int = 2) -> Result:
         """What a network makes of the test samples, with the refiner of the checkpoint if it has one."""
@@ -192,7 +190,7 @@ def runtime(lab: Laboratory) -> str:
         network, refiner = made(name)
         calls[f'{name}|eager'] = partial(TorchEngine(Pipeline(network, refiner).eval()).run, patch)
         calls[f'{name}|fast'] = partial(make_engine(network, 'cpu', refiner=refiner).run, patch)
-    rows = measure(calls, rounds=10)
+    rows = measure(calls, ROUNDS)
     table = ['| network | paper GPU | paper CPU | here, PyTorch | here, fastest engine |', '|---|---|---|---|---|']
     for name, (gpu, cpu) in PAPER_MS.items():
         table.append(f'| {name} | {gpu} | {cpu} | {rows[f"{name}|eager"]["p50_ms"]:.2f} | '

@@ -45,8 +45,8 @@ def iterations(results: Sequence[Result]) -> Figure:
         chain = [results[0], *(result for result in results[1:] if result.name.rpartition(' x')[0] == name)]
         means = [metrics.mean_mm(result.errors_mm) for result in chain]
         axes.plot(range(len(chain)), means, 'o-', color=color, label=name)
-    axes.set(title='Mean error, mm', xlabel='iterations of the refinement')
-    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.set(title='Mean error, mm', xlabel='iterations of the refinement',
+             xticks=range(max(int(result.name.rpartition(' x')[2]) for result in results[1:]) + 1))
     axes.legend(fontsize=9)
     return figure
 
@@ -88,9 +88,8 @@ def qualitative(result: Result, batches: Sequence[Batch], rows: NDArray[np.int64
                          vmax=float(center[2] + side))
             for joints, color, name in skeletons:
                 flat = _turned(torch.from_numpy(joints).float(), center, turn)
-                for parent, child in result.skeleton.bones:
-                    view.plot(*flat[[parent, child]].T, color=color, lw=1.4, alpha=0.9, label=name)
-                    name = None
+                for k, bone in enumerate(result.skeleton.bones):
+                    view.plot(*flat[list(bone)].T, color=color, lw=1.4, alpha=0.9, label=None if k else name)
             reach = float(side) / 2
             view.set(xlim=(-reach, reach), ylim=(reach, -reach), aspect='equal', xticks=[], yticks=[])
         axes[0].set_title(f'{result.errors_mm[column].mean():.0f} mm')

@@ -57,6 +57,15 @@ class Machine:
     """Seconds between two writings of the state to resume from."""
 
 
+def open_shards(recipe: Recipe, machine: Machine, split: str, device: torch.device) -> DiskShards | MemoryShards:
+    """The samples that a recipe asks for, as this machine makes them."""
+    opening = partial(open_dataset, recipe.dataset, split, Path(recipe.root) if recipe.root else None,
+                      str(device) if machine.workers == 0 else 'cpu')
+    if machine.workers == 0:
+        return MemoryShards(opening(), recipe.shard_size)
+    return DiskShards(opening, machine.cache, recipe.shard_size, machine.workers, machine.limit_gb)
+
+
 class Run:
     """One training run: `Run(folder, recipe, machine).train()`.
 
@@ -80,7 +89,7 @@ class Run:
 
         torch.manual_seed(recipe.seed)
         self.base = load_checkpoint(recipe.base) if recipe.base else None
-        self.shards = self._open_shards('train')
+        self.shards = open_shards(recipe, machine, 'train', self.device)
         self.skeleton = self.shards.dataset.skeleton
         self.stream = SampleStream(self.shards, recipe.batch_size, recipe.seed, recipe.reuse,
                                    self._first_shard(), recipe.last_shard, (self.rank, self.world))
@@ -88,7 +97,8 @@ class Run:
         self.steps = -(-self.budget // recipe.batch_size)
 
         # Channels last is what fast convolutions of few channels want, and twice as fast for them on a CPU.
-        self.objective = self._make_objective().to(self.device, memory_format=torch.channels_last)
+        objective = self._make_objective().to(self.device)
+        self.objective = objective.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.averaged = copy.deepcopy(self.objective) if recipe.average else self.objective
         self.optimizer = make_optimizer(recipe, self.objective)
         self.step, self.best_mm = 0, float('inf')
@@ -96,14 +106,6 @@ class Run:
         self._saved = time.monotonic()
 
     # What is trained, on what
-
-    def _open_shards(self, split: str) -> DiskShards | MemoryShards:
-        recipe, machine = self.recipe, self.machine
-        device = str(self.device) if machine.workers == 0 else 'cpu'
-        opening = partial(open_dataset, recipe.dataset, split, Path(recipe.root) if recipe.root else None, device)
-        if machine.workers == 0:
-            return MemoryShards(opening(), recipe.shard_size)
-        return DiskShards(opening, machine.cache, recipe.shard_size, machine.workers, machine.limit_gb)
 
     def _first_shard(self) -> int:
         """A refiner starts behind what its base was trained on."""
@@ -177,7 +179,8 @@ class Run:
             self.folder.close()
 
     def _loop(self, module: nn.Module) -> dict[str, Any]:
-        recipe, result = self.recipe, {}
+        recipe = self.recipe
+        result: dict[str, Any] = {}
         with tqdm(total=self.budget, initial=self.step * recipe.batch_size, unit='samples', unit_scale=True,
                   smoothing=0.05, disable=self.rank > 0, dynamic_ncols=True) as bar:
             while self.step < self.steps:
@@ -283,7 +286,7 @@ class Run:
 
     @cached_property
     def _validation(self) -> list[Batch]:
-        return first_samples(self._open_shards('val'), self.recipe.val_samples)
+        return first_samples(open_shards(self.recipe, self.machine, 'val', self.device), self.recipe.val_samples)
 
     def _save_checkpoint(self, name: str, result: dict[str, Any]) -> None:
         metadata = {'skeleton': self.skeleton.name, 'cube_side': CUBE_SIDE, 'validation': result,

@@ -48,7 +48,7 @@ class SampleStream:
         share = self.batch_size // world
         start = step * self.batch_size + rank * share
         numbers = np.arange(start, start + share)
-        parts = []
+        parts: list[Batch] = []
         while len(numbers):
             stage, offset, size = self._locate(int(numbers[0]))
             here = numbers[:size - offset]

@@ -565,3 +565,9 @@ def test_a_wrong_parameter_at_start_is_one_sentence() -> None:
                           capture_output=True, text=True, timeout=60)
     assert done.returncode == 1
     assert 'depth_scale' in done.stderr and 'Traceback' not in done.stderr
+
+
+def test_a_camera_info_of_another_frame_is_suspected(rig: Rig) -> None:
+    rig.start()
+    assert rig.answer(rig.camera(info=camera_info()), image(depth_with_hand(), frame='other_camera')).hands
+    rig.until_said('/depth/camera_info', 'other_camera', 'camera_optical')

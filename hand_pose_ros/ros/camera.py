@@ -24,11 +24,6 @@ class Camera:
         self._closed = False
         self._changed = threading.Condition()
 
-    @property
-    def frame_id(self) -> str:
-        """The frame of the newest camera_info, empty while there is none."""
-        return self._info.header.frame_id if self._info is not None else ''
-
     def update(self, info: CameraInfo) -> None:
         """Take a new camera_info."""
         with self._changed:
@@ -62,6 +57,20 @@ class Camera:
         except InputError as error:
             raise InputError(f'{self.topic}: {error}') from None
         return intrinsics
+
+    def source(self, params: Params) -> str:
+        """Where the intrinsics come from."""
+        if params.intrinsics_fx > 0:
+            return 'parameters'
+        return self.topic if self._info is not None else f'none yet on {self.topic}'
+
+    def frame_problem(self, frame_id: str, params: Params) -> str:
+        """What is suspicious about the frame of an image, empty if nothing: another camera may have the same size."""
+        info = self._info
+        if params.intrinsics_fx > 0 or info is None or info.header.frame_id in ('', frame_id):
+            return ''
+        return (f"its frame_id is '{frame_id}' but that of {self.topic} is '{info.header.frame_id}': if they are "
+                'different cameras, the joints are wrong; remap depth/camera_info to the one of the depth image')
 
     def _fits(self, width: int, height: int) -> bool:
         if self._info is None:

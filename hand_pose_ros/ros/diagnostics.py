@@ -20,6 +20,8 @@ MIN_SAMPLE = 10
 """Fewer than this in a second tell nothing about shares."""
 REPEAT_S = 30.0
 """The same complaint is logged again after so long."""
+MAX_AGE_S = 10.0
+"""Older images come from a bag, not from a camera: their age says nothing."""
 MAX_KINDS = 100
 """So many different complaints are remembered."""
 MAX_OUTSIDE = 0.99
@@ -50,17 +52,22 @@ class Statistics:
         self._totals: Counter[str] = Counter()
         self._logged_at: dict[str, float] = {}
 
-    def count(self, what: str, n: int = 1) -> None:
-        """Add to one of the counts."""
+    def count(self, **counts: int) -> None:
+        """Add to the counts that are named."""
         with self._lock:
-            self._window.counts[what] += n
-            self._totals[what] += n
+            self._window.counts.update(counts)
+            self._totals.update(counts)
 
     def time(self, **seconds: float) -> None:
         """Add a time to each of the stages that are named."""
         with self._lock:
             for stage, value in seconds.items():
                 self._window.seconds[stage].append(value)
+
+    def age(self, nanoseconds: int) -> None:
+        """Add the time from the stamp of an image to its answer, unless the two clocks are not the same one."""
+        if 0 <= nanoseconds < MAX_AGE_S * 1e9:
+            self.time(age=nanoseconds / 1e9)
 
     def problem(self, text: str) -> None:
         """Remember what is wrong, for the next report."""
@@ -78,14 +85,13 @@ class Statistics:
             self._logged_at[kind] = now
             return True
 
-    def report(self, node: str, state: str, engine: str, model: str) -> DiagnosticStatus:
+    def report(self, node: str, state: str, facts: dict[str, str]) -> DiagnosticStatus:
         """The status of the time since the last report, which begins a new one.
 
         Args:
             node: its name.
             state: of the lifecycle, e.g. `active`.
-            engine: what runs the network.
-            model: name or path of its weights.
+            facts: more keys and values.
         """
         with self._lock:
             window, self._window = self._window, _Window()
@@ -100,7 +106,7 @@ class Statistics:
             values[f'{stage}_p95_ms'] = f'{np.percentile(seconds, 95) * 1e3:.2f}'
         values |= {f'{what}_total': str(totals.get(what, 0))
                    for what in ('received', 'dropped', 'refused', 'answered', 'hands')}
-        values |= {'engine': engine, 'model': model}
+        values |= facts
         return DiagnosticStatus(level=level, name=f'{node}: hand pose', message=message,
                                 values=[KeyValue(key=key, value=value) for key, value in values.items()])
 

@@ -17,7 +17,6 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
-from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo, SubscriptionEventCallbacks
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -40,13 +39,12 @@ from hand_pose_ros.ros.diagnostics import Statistics, depth_problem
 from hand_pose_ros.ros.markers import HandMarkers
 from hand_pose_ros.ros.worker import NewestWorker
 
+_Transition = Callable[['EstimatorNode', LifecycleState], TransitionCallbackReturn]
 SILENCE_S = 5.0
 """Images that stay away for so long are worth a warning."""
 
-Transition = Callable[['EstimatorNode', LifecycleState], TransitionCallbackReturn]
 
-
-def _logged(transition: Transition) -> Transition:
+def _logged(transition: _Transition) -> _Transition:
     """Say why a transition failed: rclpy itself swallows exceptions."""
     def wrapper(self: EstimatorNode, state: LifecycleState) -> TransitionCallbackReturn:
         self._statistics.failure = ''
@@ -87,9 +85,7 @@ class EstimatorNode(LifecycleNode):
     @_logged
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load the network and create the publishers."""
-        params = self._params
-        self._estimator = HandPoseEstimator.from_pretrained(
-            params.model or None, device=params.device, num_threads=params.num_threads or None)
+        self._estimator = self._params.make_estimator()
         self._markers = HandMarkers(self._estimator.skeleton)
         self._joints_pub = self.create_lifecycle_publisher(HandJointsArray, 'hand/joints', qos.RESULTS)
         self._markers_pub = self.create_lifecycle_publisher(MarkerArray, 'hand/markers', qos.RESULTS)
@@ -98,14 +94,13 @@ class EstimatorNode(LifecycleNode):
 
     @_logged
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Publish the skeleton and start to listen."""
+        """Start to listen, and tell what the joints will mean."""
         super().on_activate(state)
-        assert self._estimator is not None
-        about = self._estimator.metadata
-        self._skeleton_pub.publish(skeleton_to_msg(
-            Header(stamp=self.get_clock().now().to_msg()), self._estimator.skeleton,
-            str(about.get('name', about['architecture'])), str(about['version'])))
         self._start()
+        assert self._estimator is not None
+        about, now = self._estimator.metadata, Header(stamp=self.get_clock().now().to_msg())
+        self._skeleton_pub.publish(skeleton_to_msg(
+            now, self._estimator.skeleton, str(about.get('name', about['architecture'])), str(about['version'])))
         return TransitionCallbackReturn.SUCCESS
 
     @_logged
@@ -148,24 +143,17 @@ class EstimatorNode(LifecycleNode):
 
     def _start(self) -> None:
         image_topic, info_topic = topics.input_topics(self, self._params.transport)
-        image_type = Image if self._params.transport == 'raw' else CompressedImage
-        self._decode = decode_image if image_type is Image else decode_compressed
+        raw = self._params.transport == 'raw'
+        image_type, self._decode = (Image, decode_image) if raw else (CompressedImage, decode_compressed)
         self._camera = Camera(info_topic)
         self._last_header = Header()
         self._heard_at, self._silent = time.monotonic(), False
-        self._inputs.append(self._subscribe(CameraInfo, info_topic, self._on_camera_info))
-        self._inputs.append(self._subscribe(image_type, image_topic, self._on_image))
+        for kind, topic, callback in ((CameraInfo, info_topic, self._on_camera_info),
+                                      (image_type, image_topic, self._on_image)):
+            self._inputs.append(topics.subscribe(self, kind, topic, callback, self._complain))
         self._image_topic = self._inputs[1].topic_name
         self._worker = NewestWorker(self._answer)
         self.get_logger().info(f'listening to {self._image_topic} and {self._inputs[0].topic_name}')
-
-    def _subscribe(self, message_type: type, topic: str, callback: Callable[..., None]) -> Subscription:
-        def incompatible(event: QoSRequestedIncompatibleQoSInfo) -> None:
-            self._complain(topics.explain_incompatible(self, topic, qos.policy_name(event.last_policy_kind)))
-
-        return self.create_subscription(
-            message_type, topic, callback, qos.sensor(), qos_overriding_options=qos.overriding_options(),
-            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=incompatible))
 
     def _stop(self) -> None:
         while self._inputs:
@@ -182,13 +170,11 @@ class EstimatorNode(LifecycleNode):
 
     def _on_image(self, image: Image | CompressedImage) -> None:
         self._heard_at, self._silent = time.monotonic(), False
-        self._statistics.count('received')
-        assert self._worker is not None
-        if self._worker.put(image):
-            self._statistics.count('dropped')
+        dropped = self._worker is not None and self._worker.put(image)
+        self._statistics.count(received=1, dropped=int(dropped))
 
     def _on_camera_info(self, info: CameraInfo) -> None:
-        self._statistics.count('camera_infos')
+        self._statistics.count(camera_infos=1)
         self._camera.update(info)
 
     def _on_parameters(self, changes: Sequence[Parameter]) -> SetParametersResult:
@@ -220,13 +206,21 @@ class EstimatorNode(LifecycleNode):
             self._silent = True
             kind = 'Image' if self._params.transport == 'raw' else 'CompressedImage'
             self._complain(topics.explain_silence(self, self._image_topic, f'sensor_msgs/msg/{kind}', quiet))
-        engine = self._estimator.engine.name if self._estimator is not None else 'none'
-        status = self._statistics.report(self.get_name(), self._state, engine, self._params.model or 'default')
+        status = self._statistics.report(self.get_name(), self._state, self._facts())
         if status.level == DiagnosticStatus.WARN:
             self._say(status.message)
         if self._params.publish_diagnostics:
             now = Header(stamp=self.get_clock().now().to_msg())
             self._diagnostics.publish(DiagnosticArray(header=now, status=[status]))
+
+    def _facts(self) -> dict[str, str]:
+        facts = {'model': self._params.model or 'default'}
+        if self._estimator is not None:
+            facts['engine'] = self._estimator.engine.name
+        if self._worker is not None:
+            facts |= {'image': f'{self._image_topic} {topics.describe_publishers(self, self._image_topic)}',
+                      'intrinsics': self._camera.source(self._params)}
+        return facts
 
     @property
     def _state(self) -> str:
@@ -250,16 +244,16 @@ class EstimatorNode(LifecycleNode):
             hands = self._estimate(image)
             self._joints_pub.publish(hands)
             self._statistics.time(total=time.perf_counter() - start)
-            self._statistics.count('answered')
-            self._statistics.count('hands', len(hands.hands))
+            self._statistics.age(self.get_clock().now().nanoseconds - stamp_ns(image.header))
+            self._statistics.count(answered=1, hands=len(hands.hands))
             if self._params.publish_markers and self._markers_pub.get_subscription_count():
                 self._markers_pub.publish(self._markers.update(hands, self._params.marker_lifetime))
         except HandPoseError as error:
-            self._statistics.count('refused')
+            self._statistics.count(refused=1)
             self._complain(str(error))
         except Exception:
             if self.context.ok():  # else Ctrl-C came between two steps
-                self._statistics.count('refused')
+                self._statistics.count(refused=1)
                 self._complain(f'unexpected error on an image, please report it:\n{traceback.format_exc()}')
 
     def _estimate(self, image: Image | CompressedImage) -> HandJointsArray:
@@ -274,6 +268,8 @@ class EstimatorNode(LifecycleNode):
             self._reset = False
             estimator.reset()
         self._last_header = image.header
+        if problem := self._camera.frame_problem(image.header.frame_id, params):
+            self._complain(f'{topic}: {problem}')
         hands = estimator(depth, intrinsics)
         self._statistics.time(**estimator.timings)
         if not hands and (problem := depth_problem(depth, params.min_depth, params.max_depth)):
@@ -288,10 +284,9 @@ def main(args: list[str] | None = None) -> int:
         HandPoseError: a parameter at start has a wrong type or value.
     """
     rclpy.init(args=args)
-    node = None
+    executor, node = SingleThreadedExecutor(), None
     try:
         node = EstimatorNode()
-        executor = SingleThreadedExecutor()
         executor.add_node(node)
         executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):

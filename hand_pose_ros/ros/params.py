@@ -83,6 +83,15 @@ class Params:
         if (self.intrinsics_fx > 0) != (self.intrinsics_fy > 0):
             raise HandPoseError('parameters intrinsics.fx and intrinsics.fy go together: set both, or neither')
 
+    def make_estimator(self) -> HandPoseEstimator:
+        """Load the network.
+
+        Raises:
+            HandPoseError: there are no such weights, or no such device.
+        """
+        return HandPoseEstimator.from_pretrained(
+            self.model or None, device=self.device, num_threads=self.num_threads or None)
+
     def apply(self, estimator: HandPoseEstimator) -> None:
         """Set what may change between two images."""
         estimator.side = self.side  # type: ignore[assignment]

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from rclpy.node import Node
+from collections.abc import Callable
 
-from hand_pose_ros.ros.qos import large_image_profile
+from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo, SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.subscription import Subscription
+
+from hand_pose_ros.ros import qos
 
 IMAGE, CAMERA_INFO = 'depth/image_rect', 'depth/camera_info'
 
@@ -19,6 +23,17 @@ def input_topics(node: Node, transport: str) -> tuple[str, str]:
     if info == node.resolve_topic_name(CAMERA_INFO, only_expand=True):
         info = f'{image.rpartition("/")[0]}/camera_info'
     return (image if transport == 'raw' else f'{image}/{transport}'), info
+
+
+def subscribe(node: Node, message_type: type, topic: str, callback: Callable[..., None],
+              complain: Callable[[str], None]) -> Subscription:
+    """Listen to a sensor; the user may override the quality of service, and hears of publishers that do not fit it."""
+    def incompatible(event: QoSRequestedIncompatibleQoSInfo) -> None:
+        complain(explain_incompatible(node, topic, qos.policy_name(event.last_policy_kind)))
+
+    return node.create_subscription(
+        message_type, topic, callback, qos.sensor(), qos_overriding_options=qos.overriding_options(),
+        event_callbacks=SubscriptionEventCallbacks(incompatible_qos=incompatible))
 
 
 def describe_publishers(node: Node, topic: str) -> str:
@@ -51,7 +66,7 @@ def explain_silence(node: Node, topic: str, topic_type: str, seconds: float) -> 
 
 def remedy_for_lost_images() -> str:
     """What to do where large images do not get through."""
-    return f'start the camera driver with {"=".join(large_image_profile())} in its environment (Fast DDS)'
+    return f'start the camera driver with {"=".join(qos.large_image_profile())} in its environment (Fast DDS)'
 
 
 def explain_incompatible(node: Node, topic: str, policy: str) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import torch
 from torch import Tensor
 
@@ -21,6 +23,11 @@ _PAIRS = torch.tensor(
     + [(3 * i + a, b) for i in range(1, 5) for a in (1, 2) for b in (0, 15, 16, 17, 18)])  # finger: ball of thumb, palm
 _FINGER = torch.cat([torch.arange(15) // 3, torch.full((4,), 5)])  # the digit of a capsule, 5 = palm
 _GIVE = torch.where((_FINGER[_PAIRS].min(1).values > 0) & (_FINGER[_PAIRS].max(1).values < 5), SQUEEZE, TOLERANCE)
+
+
+@cache
+def _average(device: torch.device) -> Shape:
+    return mean_shape().to(device)
 
 
 def _capsules(shape: Shape, pose: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -54,7 +61,7 @@ def overlaps(pose: Tensor, shape: Shape | None = None) -> Tensor:
     Returns:
         (B, 6, 6), symmetric: digits from thumb to little finger, then the palm; 0 where nothing overlaps.
     """
-    shape = (shape or mean_shape()).to(pose.device)
+    shape = _average(pose.device) if shape is None else shape
     start, end, radius = _capsules(shape, pose)
     a, b = _PAIRS.to(pose.device).T
     apart = _segment_distance(start[:, a], end[:, a], start[:, b], end[:, b])
@@ -90,7 +97,7 @@ def bring_together(pose: Tensor, within: float) -> Tensor:
 
     Hands whose tips are further than `within` metres from touching stay as they are.
     """
-    shape = mean_shape().to(pose.device)
+    shape = _average(pose.device)
     steps = torch.zeros(6, len(POSE), device=pose.device)
     for row, angle in enumerate(('cmc_radial', 'cmc_palmar', 'cmc_roll', 'mcp_flexion', 'ip_flexion')):
         steps[row + 1, INDEX[f'thumb_{angle}']] = 0.01

@@ -30,7 +30,7 @@ LIMITS = torch.deg2rad(torch.tensor([_LIMITS.get(n) or _FINGER_LIMITS[n.split('_
 
 # Degrees of MCP and PIP flexion of a finger.
 _CURL = {'S': (2, 4), 'O': (-14, 0), 'R': (22, 30), 'H': (42, 55), 'C': (28, 42), 'G': (55, 72), 'F': (80, 98),
-         'K': (4, 88), 'B': (76, 8), 'P': (52, 46), 'T': (66, 74)}
+         'K': (4, 88), 'B': (76, 8), 'P': (57, 47), 'T': (66, 74)}
 # Degrees of abduction of index, middle, ring and little finger.
 _SPREAD = {'together': (-3, 0, -3, -6), 'apart': (5, 0, 4, 8), 'wide': (20, 0, 18, 36), 'vee': (14, -9, -2, -3),
            'vulcan': (-4, 9, 13, 8), 'horns': (8, 0, 0, 22)}
@@ -39,8 +39,8 @@ _THUMB = {
     'out': (63, 12, 62, -9, 8, -18), 'up': (48, 22, 66, -10, 2, -14), 'side': (12, 14, 62, 4, -4, 4),
     'rest': (32, 26, 74, 10, 0, 14), 'cup': (34, 44, 88, 10, 0, 16), 'wrap': (22, 52, 100, 26, 0, 26),
     'across': (20, 47, 98, 34, 0, 48), 'tucked': (6, 34, 92, 46, 0, 34), 'key': (14, 30, 78, 16, -2, 34),
-    'index': (20, 43, 98, 16, 0, 18), 'middle': (15, 50, 102, 19, 2, 16), 'ring': (11, 56, 108, 24, 5, 17),
-    'pinky': (5, 60, 111, 32, 7, 23)}
+    'index': (21, 43, 96, 13, 0, 16), 'middle': (14, 51, 101, 18, 2, 15), 'ring': (7, 56, 106, 24, 5, 15),
+    'pinky': (1, 60, 110, 32, 8, 21)}
 
 # Weight, curl of index to little finger, spread, thumb.
 _TABLE = (

@@ -2,7 +2,7 @@
 
 Sources: hand length and breadth from the ACOPLA95 survey; joint centres as fractions of hand length and breadth from
 Buchholz et al. 1992, An et al. 1979 and Sancho-Bru et al. 2011; bones of 66 adults by Buryanov and Kotiuk 2010, which
-shortens the index and little fingers of the former a little.
+shortens thumb, index and little finger of the former a little.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ FINGER_END = 0.92
 the pulp, about one fingertip radius inside the end."""
 
 # Bones along each digit over hand length, to the end of the finger. Thumb: metacarpal, proximal, distal.
-_SEGMENTS = ((0.251, 0.196, 0.158), (0.251, 0.138, 0.112), (0.272, 0.163, 0.119), (0.253, 0.156, 0.117),
+_SEGMENTS = ((0.245, 0.181, 0.153), (0.251, 0.138, 0.112), (0.272, 0.163, 0.119), (0.253, 0.156, 0.117),
              (0.198, 0.117, 0.104))
 # Where the digits begin: x over hand breadth, y over hand length, z over hand breadth (the arch of the palm).
-_ROOTS = ((0.215, 0.105, 0.13), (0.252, 0.447, 0.02), (0.0, 0.446, 0.0), (-0.220, 0.422, 0.015), (-0.415, 0.382, 0.06))
+_ROOTS = ((0.210, 0.092, 0.13), (0.252, 0.447, 0.02), (0.0, 0.446, 0.0), (-0.220, 0.422, 0.015), (-0.415, 0.382, 0.06))
 # Half thickness of the flesh over half the breadth.
-_RADII = ((0.400, 0.234, 0.222), (0.231, 0.196, 0.176), (0.228, 0.199, 0.180), (0.212, 0.186, 0.169),
+_RADII = ((0.400, 0.238, 0.229), (0.231, 0.196, 0.176), (0.228, 0.199, 0.180), (0.212, 0.186, 0.169),
           (0.191, 0.166, 0.152))
 
 

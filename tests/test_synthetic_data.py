@@ -1,9 +1,11 @@
 """What the generator of synthetic hands promises to those who train on it."""
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
+from hand_pose_ros.cli import main
 from hand_pose_ros.detection import detect
 from hand_pose_ros.geometry import Cube, Intrinsics
 from hand_pose_ros.geometry import crop as crop_one
@@ -11,12 +13,22 @@ from hand_pose_ros.synthetic import benchmark, effects, sensors
 from hand_pose_ros.synthetic.crops import crop, settle
 from hand_pose_ros.synthetic.effects import Shot
 from hand_pose_ros.synthetic.generator import LEFT, SPLITS, SyntheticHands
-from hand_pose_ros.synthetic.renderer import View
+from hand_pose_ros.synthetic.renderer import View, plane
+from hand_pose_ros.synthetic.rig import Rig
 from hand_pose_ros.synthetic.rng import Random
 from hand_pose_ros.synthetic.sensors import SENSORS
 from hand_pose_ros.synthetic.stages import Ingredients
 
 CHUNK = 24  # smaller than by default: quick
+
+
+@pytest.fixture(scope='module', autouse=True)
+def one_thread():
+    """Small batches gain nothing from threads, and lose much on a machine that runs other tests beside."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope='module')
@@ -183,22 +195,20 @@ def test_disparity_comes_in_steps_that_grow_with_distance():
 
 def test_grazing_surfaces_are_lost_and_frontal_ones_are_not():
     v = View(*(torch.tensor([t]) for t in (588.0, 588.0, 60.0, 30.0)), 60, 120)
-    from hand_pose_ros.synthetic.renderer import plane
-    for tangent, lost in ((0.3, False), (12.0, True)):
-        normal = torch.tensor([[tangent, 0.0, 1.0]])
-        image = plane(normal, torch.tensor([0.6]), v)
-        assert (effects.grazing_holes(image, _shot(1, 'primesense')) > 0).float().mean() < 0.05 if lost else (
-            effects.grazing_holes(image, _shot(1, 'primesense')) > 0).float().mean() > 0.95
+    for tangent, low, high in ((0.3, 0.95, 1.0), (12.0, 0.0, 0.05)):
+        image = plane(torch.tensor([[tangent, 0.0, 1.0]]), torch.tensor([0.6]), v)
+        kept = (effects.grazing_holes(image, _shot(1, 'primesense')) > 0).float().mean()
+        assert low <= kept <= high
 
 
 @pytest.mark.parametrize('without', ['surface', 'poses', 'forearm', 'scenes', 'noise', 'detector'])
 def test_each_ingredient_can_be_left_out(without, batch):
-    plain = SyntheticHands('train', chunk=CHUNK, ingredients=Ingredients(**{without: False})).batch(torch.arange(CHUNK))
+    plain = SyntheticHands('train', ingredients=Ingredients(**{without: False})).batch(torch.arange(8))
     assert torch.isfinite(plain['patch']).all()
     changed = 'joints_m' if without == 'poses' else 'patch'
-    assert not torch.equal(plain[changed], batch[changed][:CHUNK])
+    assert not torch.equal(plain[changed], batch[changed][:8])
     if without != 'poses':
-        assert torch.equal(plain['joints_m'], batch['joints_m'][:CHUNK]), 'the same hands'
+        assert torch.equal(plain['joints_m'], batch['joints_m'][:8]), 'the same hands'
 
 
 def test_full_frame_and_moving_hand():
@@ -217,6 +227,40 @@ def test_full_frame_and_moving_hand():
     assert not np.array_equal(frames[0][0], frames[1][0])
     again = list(one.sequence(3, 4))
     assert np.array_equal(again[2][0], frames[2][0])
+
+
+def test_another_skin_has_the_joints_of_its_rig(shared_data):
+    rig = Rig(shared_data / 'hand_models' / 'webxr_generic_hand' / 'right.glb')
+    rigged = SyntheticHands('val', hand=rig, ingredients=Ingredients(noise=False, scenes=False)).batch(torch.arange(8))
+    ours = SyntheticHands('val', ingredients=Ingredients(noise=False, scenes=False)).batch(torch.arange(8))
+    assert rigged['visible'].float().mean() > 0.4
+    assert torch.equal(rigged['hand_present'], ours['hand_present'])
+    assert not torch.equal(rigged['patch'], ours['patch'])
+
+
+def test_command_line_shows_writes_and_measures(tmp_path, capsys, shared_data):
+    real = ['--real', str(shared_data / 'frames' / 'sr305'), '476.0', '476.0', '313.7', '242.8', '0.000125']
+    sheet = tmp_path / 'sheet.png'
+    assert main(['synth', 'show', str(sheet), '--number', '4', '--joints', '--per-sensor', '--sensors', 'd435', 'sr305',
+                 *real]) == 0
+    picture = cv2.imread(str(sheet))
+    assert picture is not None and picture.std() > 20
+
+    assert main(['synth', 'write', str(tmp_path / 'data'), '--number', '5', '--shard', '3', '--split', 'val']) == 0
+    shards = sorted((tmp_path / 'data').iterdir())
+    assert [shard.name for shard in shards] == ['val_000000000.npz', 'val_000000003.npz']
+    with np.load(shards[1]) as shard:
+        expected = SyntheticHands('val').batch(torch.tensor([3, 4]))
+        np.testing.assert_array_equal(shard['joints'], expected['joints'].numpy())
+        np.testing.assert_allclose(shard['patch'], expected['patch'].numpy(), atol=5e-4)
+
+    capsys.readouterr()
+    assert main(['synth', 'stats', '--number', '8', *real]) == 0
+    table = capsys.readouterr().out
+    assert 'real sr305' in table and 'missing' in table
+
+    assert main(['synth', 'show', str(sheet), '--sensors', 'kinect9']) == 1
+    assert "unknown sensor 'kinect9'" in capsys.readouterr().err
 
 
 def test_benchmark_is_the_frozen_one():

@@ -15,6 +15,15 @@ from hand_pose_ros.synthetic.renderer import View, depth_of, rasterise
 SIZE = 96
 
 
+@pytest.fixture(scope='module', autouse=True)
+def one_thread():
+    """Small images gain nothing from threads, and lose much on a machine that runs other tests beside."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 def view(batch: int = 1, focal: float = 200.0, height: int = SIZE, width: int = SIZE + 8) -> View:
     one = torch.ones(batch)
     return View(focal * one, 1.02 * focal * one, 50.3 * one, 47.6 * one, height, width)

@@ -39,6 +39,7 @@ def add_parser(subparsers: Any) -> None:
     common.add_argument('--split', default='train', choices=('train', 'val', 'test'), help='(train)')
     common.add_argument('--start', type=int, default=0, metavar='I', help='index of the first sample (0)')
     common.add_argument('--sensors', nargs='+', metavar='NAME', help='(all)')
+    common.add_argument('--rig', type=Path, metavar='GLB', help="another skin: a glTF hand with WebXR's joint names")
     real = argparse.ArgumentParser(add_help=False)
     real.add_argument('--real', nargs=6, action='append', default=[],
                       metavar=('FOLDER', 'FX', 'FY', 'CX', 'CY', 'SCALE'),
@@ -78,8 +79,9 @@ def run(args: argparse.Namespace) -> int:
 
 def _hands(args: argparse.Namespace, sensors: list[str] | None, **options: Any) -> SyntheticHands:
     from hand_pose_ros.synthetic.generator import SyntheticHands
+    from hand_pose_ros.synthetic.rig import Rig
     try:
-        return SyntheticHands(args.split, sensors=sensors, **options)
+        return SyntheticHands(args.split, sensors=sensors, hand=Rig(args.rig) if args.rig else None, **options)
     except ValueError as error:
         raise HandPoseError(str(error)) from error
 

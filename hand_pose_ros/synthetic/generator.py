@@ -17,6 +17,7 @@ from torch import Tensor
 
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.synthetic.crops import crop, to_cube
+from hand_pose_ros.synthetic.hand import HandModel, SkinnedHand
 from hand_pose_ros.synthetic.renderer import View, depth_of, dot
 from hand_pose_ros.synthetic.rng import Random
 from hand_pose_ros.synthetic.scenes import Scene
@@ -39,6 +40,7 @@ class SyntheticHands:
         device: where everything happens.
         sensors: names of the sensors to draw from, equally often; all by default.
         ingredients: see Ingredients.
+        hand: whose skin; the parametric hand by default, else for example a `rig.Rig`.
         chunk: samples worked on at a time; bounds memory, does not change any sample.
 
     Raises:
@@ -46,7 +48,8 @@ class SyntheticHands:
     """
 
     def __init__(self, split: str = 'train', *, seed_base: int = 0, device: str | torch.device = 'cpu',
-                 sensors: Sequence[str] | None = None, ingredients: Ingredients | None = None, chunk: int = 64) -> None:
+                 sensors: Sequence[str] | None = None, ingredients: Ingredients | None = None,
+                 hand: SkinnedHand | None = None, chunk: int = 64) -> None:
         if split not in SPLITS:
             raise ValueError(f"unknown split '{split}': choose one of {', '.join(SPLITS)}")
         self.device = torch.device(device)
@@ -54,7 +57,8 @@ class SyntheticHands:
         self.chunk = chunk
         self._first_seed = (seed_base * len(SPLITS) + SPLITS.index(split)) << 40
         names = [sensor.name for sensor in SENSORS] if sensors is None else list(sensors)
-        self._stages = Stages(self.ingredients, torch.tensor([get_sensor(name) for name in names]), self.device)
+        self._stages = Stages(self.ingredients, torch.tensor([get_sensor(name) for name in names]),
+                              hand or HandModel(), self.device)
 
     @torch.no_grad()
     def batch(self, indices: Tensor) -> dict[str, Tensor]:
@@ -72,11 +76,7 @@ class SyntheticHands:
             sensor: (B,) int64, index in sensors.SENSORS.
         """
         indices = indices.to(self.device, torch.int64)
-        parts = []
-        for some in indices.split(self.chunk):
-            # Always whole chunks: matrix products round differently in other sizes.
-            full = torch.cat([some, some[-1:].expand(self.chunk - len(some))])
-            parts.append({key: value[:len(some)] for key, value in self._chunk(self._first_seed + full).items()})
+        parts = [self._chunk(self._first_seed + some) for some in indices.split(self.chunk)]
         return {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
 
     def _chunk(self, seeds: Tensor) -> dict[str, Tensor]:

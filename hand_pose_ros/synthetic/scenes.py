@@ -24,12 +24,13 @@ VIEWS = {'frontal': 0.44, 'egocentric': 0.16, 'overhead': 0.12, 'side': 0.12, 'a
 
 # For each of VIEWS: where the fingers point, where the palm faces, and the spread about it in radians (out of the image
 # plane, within it). Frontal: held up to a camera opposite; egocentric: from one's own head; overhead: over a table.
-_BASES = torch.tensor([[[0, -1, 0], [0, 0, -1]], [[0, -0.6, 0.8], [0, 0.8, 0.6]], [[0, -1, 0], [0, 0, 1]],
+_BASES = torch.tensor([[[0, -1, 0], [0, 0, -1]], [[0, -0.8, 0.6], [0, 0.6, 0.8]], [[0, -1, 0], [0, 0, 1]],
                        [[0, -1, 0], [1, 0, 0]], [[0, -1, 0], [0, 0, -1]]], dtype=torch.float32)
 _SCATTER = torch.tensor([[0.45, 0.7], [0.5, 0.7], [0.4, 3.0], [0.5, 1.0], [3.0, 3.0]])
 _TURNED = torch.tensor([0.3, 0.4, 0.25, 0.5, 0.5])  # chance of the other face of the hand
 _HALF_HAND = 0.10  # m
-_ARM_NEAR = 0.12  # a forearm that comes this close to the camera, in metres, would come out of the camera
+_ARM_NEAR = 0.12  # a forearm that comes this close to the camera, in metres, would come out of it
+_ARM_HIDES = 0.8  # cosine between the fingers and the line of sight beyond which one sees mostly an elbow
 
 
 @dataclass
@@ -170,10 +171,11 @@ def place(vertices: Tensor, joints: Tensor, rotation: Tensor, position: Tensor) 
 
 
 def keep_arm_off_camera(rotation: Tensor, position: Tensor) -> Tensor:
-    """Rotations with the hand turned about the camera's x axis where its forearm would run into the camera."""
-    elbow_z = position[:, 2] - 0.30 * rotation[:, 2, 1]
+    """Rotations with the hand turned about its x axis where its forearm would hide it or run into the camera."""
+    away = rotation[:, 2, 1]  # how much the fingers point away from the camera
     flipped = torch.stack([rotation[:, 0], -rotation[:, 1], -rotation[:, 2]], 1)
-    return torch.where((elbow_z < _ARM_NEAR)[:, None, None], flipped, rotation)
+    bad = (away > _ARM_HIDES) | (position[:, 2] - 0.30 * away < _ARM_NEAR)
+    return torch.where(bad[:, None, None], flipped, rotation)
 
 
 def draw_solids(scene: Scene, view: View, back: Tensor | None = None, relief: Tensor | None = None) -> Tensor:

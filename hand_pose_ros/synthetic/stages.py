@@ -6,19 +6,19 @@ import math
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from hand_pose_ros.geometry import PATCH_SIZE
 from hand_pose_ros.synthetic import scenes
 from hand_pose_ros.synthetic.crops import settle
 from hand_pose_ros.synthetic.furniture import furnish
-from hand_pose_ros.synthetic.hand import HandModel
+from hand_pose_ros.synthetic.hand import HandModel, SkinnedHand
 from hand_pose_ros.synthetic.poses import LIMITS, sample_poses
 from hand_pose_ros.synthetic.renderer import View, depth_of
 from hand_pose_ros.synthetic.rng import Random
 from hand_pose_ros.synthetic.scenes import Scene
 from hand_pose_ros.synthetic.sensors import sensor_table
-from hand_pose_ros.synthetic.shapes import sample_shapes
+from hand_pose_ros.synthetic.shapes import Shape, sample_shapes
 
 CUBE_SIDE = 0.30
 """Of the product's detector, metres."""
@@ -28,8 +28,8 @@ WINDOW = 144
 _COARSE, _COARSE_SIDE = 64, 0.64  # pixels and metres across the image in which the detector's rule runs
 _NEAREST = 24  # of its pixels (1 cm2 each) make the first guess: something from a finger to a hand
 _NEGATIVES = 0.05  # share of samples without a hand
+_FOREARM = 6  # as a part of the skin
 _SECOND_HAND = 0.08  # share of samples with another hand nearby
-_SECOND_BLOCK = 8
 
 _SHAPE, _POSE, _VIEW, _CAMERA, _FURNITURE, _SECOND, CROP, _MOTION = range(8)  # streams of random numbers
 
@@ -120,17 +120,38 @@ class Stage:
                   & ((rows >= 0) & (rows < height[:, None]))[:, :, None])
         return View(fx, fy, cx - left, cy - top, WINDOW, WINDOW), inside
 
+
+class _Armed(nn.Module):
+    """A hand that ends at the wrist, such as a `Rig`, with the forearm of HandModel."""
+
+    faces: Tensor
+    vertex_part: Tensor
+    rest: Tensor
+
+    def __init__(self, hand: SkinnedHand) -> None:
+        super().__init__()
+        self.hand, self.arm = hand, HandModel()
+        arm = self.arm.faces[(self.arm.vertex_part[self.arm.faces] == _FOREARM).any(1)]
+        self.register_buffer('faces', torch.cat([hand.faces, arm + len(hand.vertex_part)]))
+        self.register_buffer('vertex_part', torch.cat([hand.vertex_part, self.arm.vertex_part]))
+        self.register_buffer('rest', self.arm.rest.clone())
+
+    def forward(self, shape: Shape, pose: Tensor) -> tuple[Tensor, Tensor]:
+        skin, joints = self.hand(shape, pose)
+        return torch.cat([skin, self.arm(shape, pose)[0]], 1), joints
+
+
 class Stages:
     """Makes stages; see `SyntheticHands` for the arguments. `sensors`: indices in SENSORS to draw from."""
 
-    def __init__(self, ingredients: Ingredients, sensors: Tensor, device: torch.device) -> None:
+    def __init__(self, ingredients: Ingredients, sensors: Tensor, hand: SkinnedHand, device: torch.device) -> None:
         self.ingredients = ingredients
         self._sensors = sensors.to(device)
-        self._hand = HandModel().to(device)
-        hand_only = (self._hand.vertex_part[self._hand.faces] != 6).any(1)
+        self._hand: SkinnedHand | _Armed = (hand if (hand.vertex_part == _FOREARM).any() else _Armed(hand)).to(device)
+        hand_only = (self._hand.vertex_part[self._hand.faces] != _FOREARM).any(1)
         self._faces = self._hand.faces if self.ingredients.forearm else self._hand.faces[hand_only]
         self._drawn = self._faces.unique()
-        forearm = (self._hand.vertex_part == 6).nonzero()[:, 0]
+        forearm = (self._hand.vertex_part == _FOREARM).nonzero()[:, 0]
         rest, _ = self._hand(sample_shapes(Random(torch.zeros(1, device=device))), self._hand.rest[None])
         self._elbow = forearm[rest[0, forearm, 1].argsort()[:8]]
 
@@ -169,7 +190,7 @@ class Stages:
         if len(chosen) == 0:
             return
         rng = Random(stage.seeds[chosen]).fork(_SECOND)
-        rng.uniform()  # the one that chose them
+        rng = rng.fork(0)  # not the number that chose them
         rotation, _ = scenes.sample_views(rng.fork(0))
         left = rng.chance(0.7)
         angle = 2 * math.pi * rng.uniform()
@@ -177,16 +198,10 @@ class Stages:
         offset = torch.stack([away * torch.cos(angle), away * torch.sin(angle), 0.05 * rng.normal()], 1)
         position = stage.position[chosen] + offset
         rotation = scenes.keep_arm_off_camera(rotation, position)
-        vertices, joints = [], []
-        for some in chosen.split(_SECOND_BLOCK):  # whole blocks, as in `batch`
-            full = torch.cat([some, some[-1:].expand(_SECOND_BLOCK - len(some))])
-            draws = Random(stage.seeds[full]).fork(_SECOND)
-            v, j = self._hand(sample_shapes(draws.fork(1)), sample_poses(draws.fork(2)))
-            vertices.append(v[:len(some)])
-            joints.append(j[:len(some)])
+        vertices, joints = self._hand(sample_shapes(rng.fork(1)), sample_poses(rng.fork(2)))
         mirror = torch.where(left, -1.0, 1.0)[:, None, None]
         mirror = torch.cat([mirror, torch.ones_like(mirror), torch.ones_like(mirror)], 2)
-        placed, _ = scenes.place(torch.cat(vertices) * mirror, torch.cat(joints) * mirror, rotation, position)
+        placed, _ = scenes.place(vertices * mirror, joints * mirror, rotation, position)
         stage.scene.others = scenes.Others(placed, chosen, left)
 
     def detect(self, stage: Stage) -> Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from pathlib import Path
 
@@ -58,7 +58,7 @@ def _outline(mask: NDArray[np.uint8]) -> float:
     return max((cv2.arcLength(contour, True) for contour in contours), default=0.0)
 
 
-def _extent(points: NDArray[np.float64]) -> float:
+def _extent(points: NDArray[np.floating]) -> float:
     if len(points) < 2:
         return 0.0
     centered = points - points.mean(0)
@@ -80,7 +80,7 @@ def summarise(patches: Iterable[tuple[NDArray[np.float32], float]]) -> dict[str,
     return {name: (float(low[i]), float(middle[i]), float(high[i])) for i, name in enumerate(rows[0])}
 
 
-def real_patches(folder: Path, intrinsics: Iterable[float], depth_scale: float,
+def real_patches(folder: Path, intrinsics: Sequence[float], depth_scale: float,
                  side: float = 0.30) -> list[tuple[NDArray[np.float32], float]]:
     """The crops that the product makes of the 16-bit depth PNGs in a folder; images without a hand are left out.
 
@@ -97,7 +97,8 @@ def real_patches(folder: Path, intrinsics: Iterable[float], depth_scale: float,
     patches = []
     for path in paths:
         depth = read_png(path, depth_scale)
-        camera = Intrinsics(*intrinsics, width=depth.shape[1], height=depth.shape[0])
+        fx, fy, cx, cy = intrinsics
+        camera = Intrinsics(fx, fy, cx, cy, width=depth.shape[1], height=depth.shape[0])
         for cube in detect(depth, camera, side=side):
             depth = np.where(depth < cube.center[2] + side, depth, 0)
             patches.append((crop(depth, Cube(cube.center, side), camera)[0], side))

@@ -61,8 +61,10 @@ class Refiner(nn.Module):
         widths = (features, *hidden, 3)
         self.weights = nn.ParameterList(torch.empty(joints, i, o) for i, o in pairwise(widths))
         self.biases = nn.ParameterList(torch.zeros(joints, 1, o) for o in widths[1:])
-        for weight in self.weights:
-            nn.init.normal_(weight, std=0.01)  # so that an untrained refiner moves nothing
+        *inner, last = self.weights
+        for weight in inner:
+            nn.init.normal_(weight, std=(2 / weight.shape[1]) ** 0.5)
+        nn.init.normal_(last, std=0.001)  # so that an untrained refiner moves nothing
         self.dropout = nn.Dropout(dropout)
 
     def forward(self, patch: Tensor, joints: Tensor, iterations: int = 2) -> Tensor:

@@ -22,6 +22,8 @@ CHECKOUT = Path(__file__).resolve().parents[1]
 PACKAGE = CHECKOUT / 'hand_pose_ros'
 FILES = sorted(path.relative_to(CHECKOUT).as_posix() for path in PACKAGE.rglob('*')
                if path.is_file() and '__pycache__' not in path.parts)
+SHARED = sorted(path.relative_to(CHECKOUT).as_posix() for folder in ('msg', 'config', 'demo', 'launch', 'rviz')
+                for path in (CHECKOUT / folder).glob('*') if path.is_file())
 MODULES = [path for path in FILES if path.endswith('.py')]
 
 POINT = 'geometry_msgs/Point'
@@ -135,14 +137,14 @@ def test_imports_go_one_way(module: str) -> None:
 
 @pytest.fixture(scope='module')
 def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of what is under version control or would be, so that building leaves nothing in the checkout."""
+    """A copy of what an installation is made from, so that building leaves nothing in the checkout."""
     copy = tmp_path_factory.mktemp('source') / 'hand_pose_ros'
-    for folder in ('hand_pose_ros', 'msg', 'scripts', 'config', 'launch', 'rviz'):
-        if (CHECKOUT / folder).is_dir():
-            shutil.copytree(CHECKOUT / folder, copy / folder)
-    for path in CHECKOUT.iterdir():
-        if path.is_file():
-            shutil.copy2(path, copy)
+    shutil.copytree(PACKAGE, copy / PACKAGE.name)
+    others = ('CMakeLists.txt', 'LICENSE', 'MANIFEST.in', 'README.md', 'package.xml', 'pyproject.toml', 'setup.py')
+    for path in (*SHARED, *others, 'scripts/estimator', 'scripts/evaluate', 'scripts/replay'):
+        if (CHECKOUT / path).exists():
+            (copy / path).parent.mkdir(exist_ok=True)
+            shutil.copy2(CHECKOUT / path, copy / path)
     return copy
 
 
@@ -161,13 +163,13 @@ def check_installation(prefix: Path, site_packages: Path) -> None:
         'AMENT_PREFIX_PATH': f'{prefix}:{sys.prefix}',
         'PATH': f'{sys.prefix}/bin:{os.environ["PATH"]}',
     }
-    code = '''
+    code = f'''
 import hand_pose_ros, hand_pose_ros.msg
 from ament_index_python.packages import get_package_prefix, get_package_share_directory
 from rclpy.serialization import deserialize_message, serialize_message
 from hand_pose_ros.resources import resource
 
-print(hand_pose_ros.__file__, hand_pose_ros.msg.__file__, resource('config/fastdds_large_images.xml'),
+print(hand_pose_ros.__file__, hand_pose_ros.msg.__file__, *map(resource, {SHARED}),
       get_package_prefix('hand_pose_ros'), get_package_share_directory('hand_pose_ros'), sep='\\n')
 message = hand_pose_ros.msg.HandSkeleton(name='hand21', parents=[-1, 0])
 assert deserialize_message(serialize_message(message), type(message)) == message
@@ -203,7 +205,7 @@ def test_pure_wheel_beside_a_ros_that_is_not_from_wheels(source: Path, tmp_path:
     assert set(FILES) <= set(names)
     assert not [name for name in names if name.endswith('.so') or name.startswith('hand_pose_ros/msg')]
     shipped = {name.partition('/data/share/hand_pose_ros/')[2] for name in names}
-    assert {'package.xml', 'config/fastdds_large_images.xml', *(f'msg/{name}.msg' for name in CONTRACT)} <= shipped
+    assert {'package.xml', *SHARED} <= shipped
 
 
 @pytest.mark.parametrize('options', [[], ['--symlink-install']], ids=['copied', 'symlinked'])

@@ -166,6 +166,8 @@ class Run:
         if resume:
             progress = load_state(self.folder.state, self._modules(), self.optimizer)
             self.step, self.best_mm = progress['step'], progress['best_mm'] or float('inf')
+            if progress['data'] != self.shards.dataset.fingerprint:
+                log.warning('the training data, or the code that makes them, have changed since step %s', self.step)
         elif self.rank == 0:
             self.folder.create(self.recipe)
         if self.rank == 0:
@@ -306,4 +308,5 @@ class Run:
         if self.rank == 0:
             save_state(self.folder.state, self._modules(), self.optimizer,
                        {'step': self.step, 'finished': self.step >= self.steps,
+                        'data': self.shards.dataset.fingerprint,
                         'best_mm': self.best_mm if self.best_mm < float('inf') else None})

@@ -489,6 +489,13 @@ def test_incompatible_quality_of_service_is_named_with_its_remedy(rig: Rig) -> N
                    'qos_overrides./depth/image_rect.subscription.reliability')
 
 
+def test_a_wrong_quality_of_service_is_named(rig: Rig) -> None:
+    name = 'qos_overrides./depth/image_rect.subscription'
+    rig.start(**{f'{name}.reliability': 'perhaps'})
+    rig.until_said(name, 'perhaps')
+    assert rig.state() == 'inactive' and rig.client.count_subscribers('/depth/camera_info') == 0
+
+
 def test_diagnostics_tell_rates_times_and_hints(rig: Rig) -> None:
     rig.start()
     publish = rig.camera(info=camera_info())

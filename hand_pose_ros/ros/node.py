@@ -55,6 +55,7 @@ def _logged(transition: _Transition) -> _Transition:
         except Exception:
             result = TransitionCallbackReturn.ERROR
             self._statistics.failure = f'unexpected error, please report it:\n{traceback.format_exc()}'
+        self._stop()
         self.get_logger().error(self._statistics.failure)
         return result
     return wrapper
@@ -170,8 +171,7 @@ class EstimatorNode(LifecycleNode):
 
     def _on_image(self, image: Image | CompressedImage) -> None:
         self._heard_at, self._silent = time.monotonic(), False
-        dropped = self._worker is not None and self._worker.put(image)
-        self._statistics.count(received=1, dropped=int(dropped))
+        self._statistics.count(received=1, dropped=int(self._worker is not None and self._worker.put(image)))
 
     def _on_camera_info(self, info: CameraInfo) -> None:
         self._statistics.count(camera_infos=1)

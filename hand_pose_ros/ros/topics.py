@@ -8,6 +8,7 @@ from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo, SubscriptionEve
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 
+from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.ros import qos
 
 IMAGE, CAMERA_INFO = 'depth/image_rect', 'depth/camera_info'
@@ -27,13 +28,21 @@ def input_topics(node: Node, transport: str) -> tuple[str, str]:
 
 def subscribe(node: Node, message_type: type, topic: str, callback: Callable[..., None],
               complain: Callable[[str], None]) -> Subscription:
-    """Listen to a sensor; the user may override the quality of service, and hears of publishers that do not fit it."""
+    """Listen to a sensor; the user may override the quality of service, and hears of publishers that do not fit it.
+
+    Raises:
+        HandPoseError: the user's quality of service is none.
+    """
     def incompatible(event: QoSRequestedIncompatibleQoSInfo) -> None:
         complain(explain_incompatible(node, topic, qos.policy_name(event.last_policy_kind)))
 
-    return node.create_subscription(
-        message_type, topic, callback, qos.sensor(), qos_overriding_options=qos.overriding_options(),
-        event_callbacks=SubscriptionEventCallbacks(incompatible_qos=incompatible))
+    try:
+        return node.create_subscription(
+            message_type, topic, callback, qos.sensor(), qos_overriding_options=qos.overriding_options(),
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=incompatible))
+    except RuntimeError as error:
+        raise HandPoseError(f'cannot listen to {topic} ({error}): correct the parameters '
+                            f'qos_overrides.{topic}.subscription.*') from error
 
 
 def describe_publishers(node: Node, topic: str) -> str:

@@ -1,0 +1,76 @@
+"""`hand-pose demo`: a bag goes through the live node, and pictures and numbers come out."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='needs ROS 2')
+pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
+
+from hand_pose_ros.bags import BagWriter
+from hand_pose_ros.cli import main
+from hand_pose_ros.cli.demo import summarise
+from hand_pose_ros.estimator import HandEstimate
+from hand_pose_ros.geometry import Cube, Intrinsics
+from hand_pose_ros.models import build
+from hand_pose_ros.models.checkpoints import save_checkpoint
+from hand_pose_ros.msg import HandJointsArray
+from hand_pose_ros.ros.live import Answers
+from hand_pose_ros.skeleton import HAND21
+
+COUNT = 6
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    """A network that has learned nothing."""
+    path = tmp_path / 'weights.safetensors'
+    save_checkpoint(path, build('deep_prior', joints=21), {'skeleton': 'hand21', 'cube_side': 0.3})
+    return path
+
+
+def write_bag(path: Path) -> None:
+    """A disc that moves to the right, and its centre as the truth of every joint."""
+    intrinsics = Intrinsics(280, 280, 160, 120, 320, 240)
+    with BagWriter(path) as bag:
+        for i in range(COUNT):
+            stamp, center = 10**9 + i * 40_000_000, (0.02 * i, 0.0, 0.6)
+            v, u = np.mgrid[:240, :320]
+            disc = np.hypot(u - intrinsics.project(center)[0], v - 120) < 28
+            depth = np.where(disc, 0.6, 2.0).astype(np.float32)
+            bag.write_depth(stamp, 'camera', depth, intrinsics)
+            truth = HandEstimate(np.tile(np.float32(center), (21, 1)), HAND21.joint_names, np.ones(21, np.float32), 1.0,
+                                 'right', Cube(center, 0.3), 'truth')
+            bag.write_hands(stamp, 'camera', [truth], topic='/truth/joints')
+
+
+def test_the_demo_leaves_pictures_and_numbers(tmp_path: Path, weights: Path, ros_domain: int,
+                                              capfd: pytest.CaptureFixture[str]) -> None:
+    write_bag(tmp_path / 'hand.mcap')
+    out = tmp_path / 'out'
+    assert main(['demo', '--bag', str(tmp_path / 'hand.mcap'), '--model', str(weights), '--out', str(out)]) == 0
+    summary = json.loads((out / 'summary.json').read_text())
+    assert summary['frames_in'] == summary['frames_answered'] == COUNT
+    assert 0 < summary['latency_p50_ms'] <= summary['latency_p99_ms']
+    if summary['frames_with_a_hand']:  # an untrained network may not be sure enough
+        assert 0 < summary['joint_error_mean_mm'] < 300
+    assert cv2.imread(str(out / 'sheet.png')).shape[0] >= 320
+    from PIL import Image
+    with Image.open(out / 'animation.webp') as animation:
+        assert animation.n_frames > 1
+    said = capfd.readouterr().out
+    assert 'frames answered' in said and 'latency p99 ms' in said
+
+
+def test_an_image_without_an_answer_is_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    answers = Answers('hand21', {1: HandJointsArray()}, {1: 0.012})
+    summary = summarise([1, 2], answers, {1: []}, {})
+    assert (summary['frames_in'], summary['frames_answered'], summary['frames_with_a_hand']) == (2, 1, 0)
+    assert summary['latency_p50_ms'] == pytest.approx(12) and summary['joint_error_mean_mm'] is None
+
+    write_bag(tmp_path / 'hand.mcap')
+    monkeypatch.setattr('hand_pose_ros.ros.live.play_through_node', lambda *_, **__: answers)
+    assert main(['demo', '--bag', str(tmp_path / 'hand.mcap'), '--out', str(tmp_path / 'out')]) == 1

@@ -80,10 +80,7 @@ def run(args: argparse.Namespace) -> int:
 def _hands(args: argparse.Namespace, sensors: list[str] | None, **options: Any) -> SyntheticHands:
     from hand_pose_ros.synthetic.generator import SyntheticHands
     from hand_pose_ros.synthetic.rig import Rig
-    try:
-        return SyntheticHands(args.split, sensors=sensors, hand=Rig(args.rig) if args.rig else None, **options)
-    except ValueError as error:
-        raise HandPoseError(str(error)) from error
+    return SyntheticHands(args.split, sensors=sensors, hand=Rig(args.rig) if args.rig else None, **options)
 
 
 def _indices(start: int, number: int, step: int) -> Iterator[Tensor]:

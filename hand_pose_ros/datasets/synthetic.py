@@ -10,6 +10,7 @@ from torch import Tensor
 
 import hand_pose_ros.synthetic
 from hand_pose_ros.datasets.base import Batch, Dataset, DatasetError
+from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.skeleton import HAND21
 
 LEFT = 1
@@ -31,7 +32,7 @@ class Synthetic(Dataset):
         try:
             # The test split is the benchmark synthetic-test-v1 and goes on behind its end.
             self._hands = SyntheticHands(split, device=device, sensors=SENSORS if split == 'test' else None)
-        except ValueError as error:
+        except HandPoseError as error:
             raise DatasetError(f'synthetic: {error}') from error
         # Any change of the code that makes the samples makes other samples.
         sources = sorted(Path(hand_pose_ros.synthetic.__path__[0]).glob('*.py'))

@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.synthetic.crops import crop, to_cube
 from hand_pose_ros.synthetic.hand import HandModel, SkinnedHand
@@ -44,14 +45,14 @@ class SyntheticHands:
         chunk: samples worked on at a time; bounds memory, does not change any sample.
 
     Raises:
-        ValueError: an unknown split or sensor.
+        HandPoseError: an unknown split or sensor.
     """
 
     def __init__(self, split: str = 'train', *, seed_base: int = 0, device: str | torch.device = 'cpu',
                  sensors: Sequence[str] | None = None, ingredients: Ingredients | None = None,
                  hand: SkinnedHand | None = None, chunk: int = 64) -> None:
         if split not in SPLITS:
-            raise ValueError(f"unknown split '{split}': choose one of {', '.join(SPLITS)}")
+            raise HandPoseError(f"unknown split '{split}': choose one of {', '.join(SPLITS)}")
         self.device = torch.device(device)
         self.ingredients = ingredients or Ingredients()
         self.chunk = chunk

@@ -12,6 +12,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
+from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.synthetic import effects
 from hand_pose_ros.synthetic.effects import Shot
@@ -70,11 +71,11 @@ def get_sensor(name: str) -> int:
     """Index in SENSORS of the sensor of this name.
 
     Raises:
-        ValueError: there is none.
+        HandPoseError: there is none.
     """
     names = [sensor.name for sensor in SENSORS]
     if name not in names:
-        raise ValueError(f"unknown sensor '{name}': choose one of {', '.join(names)}")
+        raise HandPoseError(f"unknown sensor '{name}': choose one of {', '.join(names)}")
     return names.index(name)
 
 

@@ -25,7 +25,8 @@ _EXAMPLES = """examples:
 Networks have random weights unless --model gives others: speed does not depend on them. All rows of a group run in
 turn, round by round, so that whatever else the machine does meets them alike. floor is the larger of two times, both
 measured in the same run: the operations at the rate of a large matrix product, and the weights read once by a
-matrix-vector product.
+matrix-vector product. cpu_ms is the CPU time of a call in all threads; with --threads 1 it is what the call takes
+when nothing else runs.
 """
 _WARM_UP = 5
 _CALLS = 10
@@ -77,28 +78,28 @@ def run(args: argparse.Namespace) -> int:
 
 
 def measure(calls: dict[str, Callable[[], Any]], rounds: int) -> dict[str, dict[str, float]]:
-    """Time each call `rounds` x 10 times, in turn: {name: {p50_ms, p99_ms, min_ms, calls}}."""
-    import numpy as np
-
+    """Time each call `rounds` x 10 times, in turn: one row for each, by name."""
     for call in calls.values():
         for _ in range(_WARM_UP):
             call()
-    times: dict[str, list[float]] = {name: [] for name in calls}
+    wall: dict[str, list[float]] = {name: [] for name in calls}
+    cpu: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(rounds):
         for name, call in calls.items():
             for _ in range(_CALLS):
-                start = time.perf_counter()
+                start, start_cpu = time.perf_counter(), time.process_time()
                 call()
-                times[name].append(time.perf_counter() - start)
-    return {name: summary(np.array(seconds)) for name, seconds in times.items()}
+                cpu[name].append(time.process_time() - start_cpu)
+                wall[name].append(time.perf_counter() - start)
+    return {name: {**summary(wall[name]), 'cpu_ms': summary(cpu[name])['p50_ms']} for name in calls}
 
 
-def summary(seconds: Any) -> dict[str, float]:
-    """Times in seconds -> one row."""
+def summary(seconds: list[float]) -> dict[str, float]:
+    """Times in seconds -> one row: {p50_ms, p99_ms, min_ms, calls}."""
     import numpy as np
 
     p50, p99 = np.percentile(seconds, [50, 99]) * 1e3
-    return {'p50_ms': float(p50), 'p99_ms': float(p99), 'min_ms': float(np.min(seconds) * 1e3), 'calls': len(seconds)}
+    return {'p50_ms': float(p50), 'p99_ms': float(p99), 'min_ms': min(seconds) * 1e3, 'calls': len(seconds)}
 
 
 def _network_rows(architecture: str, threads: int, rounds: int, compiled: bool) -> dict[str, dict[str, float]]:
@@ -188,8 +189,6 @@ def _refiner_rows(architecture: str, threads: int, rounds: int) -> dict[str, dic
 
 def _frame_rows(model: str | None, threads: int, rounds: int) -> dict[str, dict[str, float]]:
     """From a VGA image of 16-bit integers to joints in metres, in all and by stage; a hand that is tracked."""
-    import numpy as np
-
     from hand_pose_ros.depth import to_metres, to_units
     from hand_pose_ros.estimator import HandPoseEstimator
     from hand_pose_ros.models import build
@@ -223,7 +222,7 @@ def _frame_rows(model: str | None, threads: int, rounds: int) -> dict[str, dict[
 
     rows = measure({f'frame {name}': frame(name) for name in estimators}, rounds)
     for name, seconds in stages.items():
-        rows[name] = summary(np.array(seconds[_WARM_UP:]))
+        rows[name] = summary(seconds[_WARM_UP:])
     return rows
 
 
@@ -235,9 +234,10 @@ def _floor(module: nn.Module, inputs: tuple[Tensor, ...], threads: int, reads: i
     with FlopCounterMode(display=False) as counter:
         module(*inputs)
     operations, weights = counter.get_total_flops(), sum(p.numel() for p in module.parameters())
-    side = 1024
+    side = 512
     square, matrix = torch.rand(side, side), torch.rand(-(-weights // side), side)
     times = measure({'multiply': lambda: square @ square, 'read': lambda: matrix @ square[0]}, rounds=3)
+    # The best of many, for a floor is what no one has gone below.
     compute = times['multiply']['min_ms'] * operations / (2 * side ** 3)
     memory = times['read']['min_ms'] * reads
     floor = max(compute, memory)
@@ -277,7 +277,8 @@ def _cpu_name() -> str:
 
 def _table(rows: dict[str, dict[str, float]]) -> str:
     width = max(map(len, rows))
-    lines = [f'{"":{width}}  {"p50 ms":>8} {"p99 ms":>8} {"best ms":>8}']
-    lines += [f'{name:{width}}  {row["p50_ms"]:8.3f} {row["p99_ms"]:8.3f} {row["min_ms"]:8.3f}'
+    columns = ('p50_ms', 'p99_ms', 'min_ms', 'cpu_ms')
+    lines = [' ' * width + ''.join(f'{column:>10}' for column in columns)]
+    lines += [f'{name:{width}}' + ''.join(f'{row[c]:10.3f}' if c in row else ' ' * 10 for c in columns)
               for name, row in rows.items()]
     return '\n'.join(lines)

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
-from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.ros import qos
+
+try:
+    from rclpy.event_handler import SubscriptionEventCallbacks
+except ImportError:  # ROS 2 Humble
+    from rclpy.qos_event import SubscriptionEventCallbacks
 
 IMAGE, CAMERA_INFO = 'depth/image_rect', 'depth/camera_info'
 
@@ -33,7 +38,7 @@ def subscribe(node: Node, message_type: type, topic: str, callback: Callable[...
     Raises:
         HandPoseError: the user's quality of service is none.
     """
-    def incompatible(event: QoSRequestedIncompatibleQoSInfo) -> None:
+    def incompatible(event: Any) -> None:
         complain(explain_incompatible(node, topic, qos.policy_name(event.last_policy_kind)))
 
     try:
@@ -70,7 +75,7 @@ def explain_silence(node: Node, topic: str, topic_type: str, seconds: float) -> 
         return f'{said}{where}: start the camera, or name its topic with --ros-args -r {IMAGE}:=/its/topic'
     if all(info.topic_type != topic_type for info in infos):
         return f'{said}, but {topic_type} is expected: remap {IMAGE}, or set the parameter transport'
-    return f'{said}: if it does publish, {remedy_for_lost_images()}'
+    return f'{said}: if it does publish, and nothing was said of its quality of service, {remedy_for_lost_images()}'
 
 
 def remedy_for_lost_images() -> str:

@@ -170,7 +170,8 @@ def test_sensors_read_a_wall_right_and_nothing_as_nothing(name):
 def _shot(batch: int, sensor: str, mirrored: bool = False) -> Shot:
     s = SENSORS[sensors.get_sensor(sensor)]
     as_tensor = lambda value: torch.full((batch, 1, 1), value)  # noqa: E731
-    return Shot(Random(torch.arange(batch)), as_tensor(s.intrinsics.fx), as_tensor(1.0), as_tensor(1.0),
+    rng = Random(torch.arange(batch))
+    return Shot(rng.fork(1), rng, as_tensor(s.intrinsics.fx), as_tensor(1.0), as_tensor(1.0),
                 as_tensor(mirrored), as_tensor(s.baseline), as_tensor(s.noise), as_tensor(max(s.step, 1e-3)),
                 as_tensor(s.smoothing), 60, 120)
 

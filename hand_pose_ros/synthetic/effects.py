@@ -42,6 +42,7 @@ class Shot:
     """What the noise of one batch of images depends on; tensors are (B, 1, 1).
 
     Attributes:
+        rng: for what differs from image to image; lasting: for what stays while a camera looks at a scene.
         focal: focal length in pixels of the images at hand.
         scale: its ratio to the sensor's own: below 1 where a window was thinned out.
         severity: factor on everything random: no two units, rooms and skins are alike.
@@ -50,6 +51,7 @@ class Shot:
     """
 
     rng: Random
+    lasting: Random
     focal: Tensor
     scale: Tensor
     severity: Tensor
@@ -67,12 +69,13 @@ class Shot:
         return self.focal / self.scale * self.baseline
 
     def field(self, kind: str) -> Tensor:
-        """(B, H, W) fresh normal noise of unit variance: 'white', 'smooth' (over 2 px) or 'blobs' (6 px).
+        """(B, H, W) normal noise of unit variance: 'white', 'smooth' (over 2 px) or the lasting 'blobs' (6 px).
 
         Cut at random from a fixed tile: many times faster than a random number per pixel.
         """
-        row, column = (self.rng.uniform(2) * _TILE).long().unbind(1)
-        return _noise(kind, self.height, self.width, self.rng.device)[row, column]
+        rng = self.lasting if kind == 'blobs' else self.rng
+        row, column = (rng.uniform(2) * _TILE).long().unbind(1)
+        return _noise(kind, self.height, self.width, rng.device)[row, column]
 
 
 def _spread(nearness: Tensor, combine: Callable[[Tensor, Tensor], Tensor] = torch.maximum) -> Tensor:
@@ -166,8 +169,8 @@ def grazing_holes(nearness: Tensor, shot: Shot) -> Tensor:
 
 def dark_spots(nearness: Tensor, shot: Shot) -> Tensor:
     """Dark or shiny patches (hair, cloth, rings, wet skin) and single pixels that return nothing."""
-    patchy = 2.3 + 3.0 * shot.rng.uniform(1, 1)
-    speckle = 3.0 + 2.0 * shot.rng.uniform(1, 1)
+    patchy = 2.3 + 3.0 * shot.lasting.uniform(1, 1)
+    speckle = 3.0 + 2.0 * shot.lasting.uniform(1, 1)
     lost = (shot.field('blobs') > patchy) | (shot.field('white') > speckle)
     return torch.where(lost, 0, nearness)
 
@@ -175,7 +178,7 @@ def dark_spots(nearness: Tensor, shot: Shot) -> Tensor:
 def edge_smear(nearness: Tensor, shot: Shot) -> Tensor:
     """A pixel gathers light from more than its own square, and the nearer surface sends more: silhouettes grow by about
     a pixel, and their outermost pixels lie 5-40 mm too deep (measured on recordings of a second Kinect)."""
-    amount = shot.scale * (0.5 + shot.rng.uniform(1, 1))
+    amount = shot.scale * (0.5 + shot.lasting.uniform(1, 1))
     within = nearness - ((nearness - _mean(nearness)) * (0.12 * amount)).clamp(max=0.03)
     front = _spread(nearness)
     ramp = (0.022 + 0.009 * shot.field('white')).clamp(0.004, 0.04)
@@ -191,7 +194,7 @@ def flying_pixels(nearness: Tensor, shot: Shot) -> Tensor:
     front, back = _spread(nearness), _spread(nearness, torch.minimum)
     behind = front - nearness > 0.06 * front
     luck = shot.field('white') + shot.field('smooth')
-    kept = 2.0 + 2.0 * shot.rng.uniform(1, 1)  # how sharp the driver's filter is set
+    kept = 2.0 + 2.0 * shot.lasting.uniform(1, 1)  # how sharp the driver's filter is set
     between = back + (0.5 + 0.35 * shot.field('white')).clamp(0, 1) * (front - back)
     return torch.where(behind & (luck > -2.0), torch.where(luck > kept, between, 0), nearness)
 
@@ -202,7 +205,7 @@ def multipath(nearness: Tensor, shot: Shot) -> Tensor:
     around = functional.avg_pool2d(nearness[:, None], 8, ceil_mode=True)
     around = functional.interpolate(around, size, mode='bilinear')[:, 0]
     hollow = (around / nearness.clamp(min=1e-6) - 1).clamp(0, 0.03)
-    gain = 0.4 * shot.severity * shot.rng.uniform(1, 1)
+    gain = 0.4 * shot.severity * shot.lasting.uniform(1, 1)
     return nearness / (1 + gain * hollow)
 
 

@@ -62,8 +62,8 @@ class Furnisher:
         gap = torch.where(rng.chance(0.25), 0.0, -torch.log(1 - rng.uniform()) * 0.25)
         self.scene.soft.append(Solid(renderer.plane, samples, (normal[samples], (touch + gap)[samples])))
 
-    def body(self) -> None:
-        """Torso, head and upper arm of the person whose hand it is, behind the hand."""
+    def body(self, arm: bool) -> None:
+        """Torso and head of the person whose hand it is, behind the hand, and the upper arm, with or without them."""
         rng = self._draws()
         samples = self._chance(rng, {'overhead': 0.1, 'egocentric': 0.05, 'any': 0.6})
         size = rng.uniform(3, low=0.85, high=1.15)
@@ -79,8 +79,14 @@ class Furnisher:
         self._ellipsoid(self.scene.soft, samples, center + above, axes, head)
         shoulder = center + torch.stack([torso[:, 0] * torch.where(rng.chance(0.5), 0.95, -0.95), -0.75 * torso[:, 1],
                                          torch.zeros_like(gap)], 1)
-        thick = 0.042 * size[:, 0]
-        self._cone(self.scene.soft, samples, self.elbow, shoulder, thick, thick * 1.35)
+        if arm:
+            away, behind = self.elbow - self.scene.joints[:, 0], torch.tensor([0.0, 0.0, 0.4], device=rng.device)
+            free = self.elbow + 0.3 * normalize(normalize(away) + rng.normal(3, std=0.5) + behind)
+            free = torch.cat([free[:, :2], free[:, 2:].clamp(min=0.2)], 1)
+            seated = torch.zeros(len(rng), dtype=torch.bool, device=rng.device).index_fill_(0, samples, True)
+            thick = 0.042 * size[:, 0]
+            self._cone(self.scene.soft, self.scene.present.nonzero()[:, 0], self.elbow,
+                       torch.where(seated[:, None], shoulder, free), thick, thick * 1.35)
 
     def sleeve(self) -> None:
         """A sleeve from somewhere along the forearm to the elbow, loose or tight."""
@@ -147,7 +153,7 @@ class Furnisher:
 
 
 def furnish(rng: Random, scene: Scene, view: Tensor, elbow: Tensor, around: Scene | None = None, *,
-            arm: bool = True) -> None:
+            arm: bool = True, alone: bool = False) -> None:
     """Fill scenes with what else there is.
 
     Args:
@@ -155,9 +161,15 @@ def furnish(rng: Random, scene: Scene, view: Tensor, elbow: Tensor, around: Scen
         elbow: (B, 3) in metres.
         around: where the hands were when the rest was put in place (they may move); as they are now by default.
         arm: whether the hands have arms, which then may be clothed.
+        alone: leave out what may cover or imitate a hand.
     """
     furnisher = Furnisher(rng, scene, view, elbow, around or scene)
-    for add in (furnisher.surface, furnisher.body, furnisher.held, furnisher.clutter, furnisher.no_hand):
-        add()
+    # Each draws from the next stream of random numbers: the order matters.
+    furnisher.surface()
+    furnisher.body(arm)
     if arm:
         furnisher.sleeve()
+    if not alone:
+        furnisher.held()
+        furnisher.clutter()
+        furnisher.no_hand()

@@ -87,7 +87,7 @@ class SyntheticHands:
         view, inside = stage.window(center, side)
         clean, own = self._stages.draw(stage, view, center[:, 2] + side / 2)
         clean = torch.where(inside, clean, 0)
-        depth = self._sense(stage, clean, view, seeds)
+        depth = self._sense(stage, clean, view)
         joints = to_cube(scene.joints, center, side)
         visible = self._visible(scene, view, clean, own, inside)
         flip = torch.where(stage.mirrored, -1.0, 1.0)[:, None] * torch.tensor([1.0, 0, 0], device=self.device)
@@ -98,10 +98,10 @@ class SyntheticHands:
                 'cube_side': side, 'visible': visible, 'hand_present': scene.present,
                 'side': torch.where(stage.mirrored, LEFT, RIGHT), 'sensor': stage.sensor}
 
-    def _sense(self, stage: Stage, clean: Tensor, view: View, seeds: Tensor) -> Tensor:
+    def _sense(self, stage: Stage, clean: Tensor, view: View, frame: int = 0) -> Tensor:
         if not self.ingredients.noise:
             return depth_of(clean)
-        return sense(clean, seeds, stage.sensor, view.fx, stage.mirrored)
+        return sense(clean, stage.seeds, stage.sensor, view.fx, stage.mirrored, frame)
 
     def _cubes(self, stage: Stage) -> tuple[Tensor, Tensor]:
         """Centres (B, 3) and sides (B,) of the crops: half as the detector finds them, half as tracking would."""
@@ -136,7 +136,7 @@ class SyntheticHands:
         The side is 'none' and the joints 0 where there is no hand.
         """
         stage = self._stages.build(torch.tensor([self._first_seed + index], device=self.device))
-        return self._whole(stage, stage.seeds)
+        return self._whole(stage)
 
     @torch.no_grad()
     def sequence(self, index: int, frames: int, *, frames_per_key: int = 24,
@@ -151,13 +151,13 @@ class SyntheticHands:
         for frame in range(frames):
             key, part = divmod(frame, frames_per_key)
             stage = self._stages.build(seeds, keys.between(key, part / frames_per_key), around)
-            yield self._whole(stage, seeds * frames + frame)
+            yield self._whole(stage, frame)
 
-    def _whole(self, stage: Stage, noise: Tensor) -> tuple[NDArray[np.float32], Intrinsics, NDArray[np.float32], str]:
+    def _whole(self, stage: Stage, frame: int = 0) -> tuple[NDArray[np.float32], Intrinsics, NDArray[np.float32], str]:
         fx, fy, cx, cy, width, height = stage.camera()
         view = View(fx, fy, cx, cy, int(height), int(width))
         clean, _ = self._stages.draw(stage, view)
-        depth = self._sense(stage, clean, view, noise)[0].cpu().numpy()
+        depth = self._sense(stage, clean, view, frame)[0].cpu().numpy()
         joints, side = stage.scene.joints[0].cpu().numpy(), 'right'
         if stage.mirrored:
             depth, side = np.ascontiguousarray(depth[:, ::-1]), 'left'

@@ -97,15 +97,16 @@ FAMILIES: dict[str, tuple[Callable[[Tensor, Shot], Tensor], ...]] = {
 """What happens to the light, in this order."""
 
 
-def sense(nearness: Tensor, seeds: Tensor, sensor: Tensor, focal: Tensor, mirrored: Tensor) -> Tensor:
+def sense(nearness: Tensor, seeds: Tensor, sensor: Tensor, focal: Tensor, mirrored: Tensor, frame: int = 0) -> Tensor:
     """What the sensors make of perfect images.
 
     Args:
         nearness: (B, H, W), 1/z in 1/m.
-        seeds: (B,) of the noise.
+        seeds: (B,) of the noise and of all that is lasting about camera and scene.
         sensor: (B,) indices in SENSORS.
         focal: (B,) focal length of these images, px; lower than the sensor's where they were thinned out.
         mirrored: (B,) bool, whether the images are to be mirrored afterwards.
+        frame: number of these images among others that show the same.
 
     Returns:
         (B, H, W) depth in metres, 0 = no reading.
@@ -121,8 +122,10 @@ def sense(nearness: Tensor, seeds: Tensor, sensor: Tensor, focal: Tensor, mirror
             return sensor_table(field, sensor.device)[sensor[members]][:, None, None]
 
         rng = Random(seeds[members])
+        lasting = rng.fork(0)
         focal_here = focal[members][:, None, None]
-        shot = Shot(rng, focal_here, focal_here / of_sensor('fx'), rng.uniform(1, 1, low=0.5, high=1.5),
+        shot = Shot(rng.fork(1 + frame), lasting, focal_here, focal_here / of_sensor('fx'),
+                    lasting.uniform(1, 1, low=0.5, high=1.5),
                     mirrored[members][:, None, None], of_sensor('baseline'), of_sensor('noise'), of_sensor('step'),
                     of_sensor('smoothing'), *nearness.shape[1:])
         image = nearness[members]

@@ -174,7 +174,8 @@ class Stages:
         scene = Scene(vertices, joints, present)
         stage = Stage(seeds, scene, sensor, mirrored, position, vertices[:, self._elbow].mean(1))
         if self.ingredients.scenes:
-            furnish(rng.fork(_FURNITURE), scene, kind, stage.elbow, around, arm=self.ingredients.forearm)
+            furnish(rng.fork(_FURNITURE), scene, kind, stage.elbow, around, arm=self.ingredients.forearm,
+                    alone=motion is not None)
             if motion is None:
                 self._second_hands(stage)
         return stage

@@ -6,11 +6,16 @@ detector is kept, with sizes in metres instead of pixels, no bias at the border 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from hand_pose_ros.geometry import Cube, Intrinsics
+
+Region = tuple[int, int, int, int]
+"""A rectangle of an image in pixels: x, y, width, height (as sensor_msgs/RegionOfInterest)."""
 
 MIN_AREA_M2 = 15e-4
 """What is smaller than this, seen from the camera, is a speck or a cable: a fist seen end on has about 40 cm2."""
@@ -62,7 +67,7 @@ class _Scene:
 
 
 def detect(depth: NDArray[np.float32], intrinsics: Intrinsics, *, side: float = 0.30, near: float = 0.1,
-           far: float = 1.5, max_hands: int = 1) -> list[Cube]:
+           far: float = 1.5, max_hands: int = 1, regions: Sequence[Region] | None = None) -> list[Cube]:
     """Cubes around the nearest hand-sized objects, nearest first; empty when there is none.
 
     Starting at the camera, everything nearer than a growing distance is looked at. The first connected piece of at
@@ -74,7 +79,13 @@ def detect(depth: NDArray[np.float32], intrinsics: Intrinsics, *, side: float = 
         depth: (H, W) float32 metres, 0 = no reading.
         side: of the cubes, metres.
         near, far: range in which hands are looked for, metres.
+        regions: what lies outside these rectangles does not count; None = the whole image.
     """
+    if regions is not None:
+        inside = np.zeros(depth.shape, bool)
+        for x, y, width, height in regions:
+            inside[max(y, 0):max(y + height, 0), max(x, 0):max(x + width, 0)] = True
+        depth = np.where(inside, depth, np.float32(0))
     scene = _Scene(depth, intrinsics, near, far)
     found: list[Cube] = []
     z, unseen = scene.z, scene.z > 0

@@ -7,7 +7,7 @@ next one need not be searched.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import count
@@ -17,18 +17,21 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hand_pose_ros.detection import detect, holds_a_hand
+from hand_pose_ros.detection import Region, detect, holds_a_hand
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.geometry import Cube, Intrinsics, crop
 from hand_pose_ros.models.checkpoints import load_checkpoint
 from hand_pose_ros.runtime import Engine, make_engine
 from hand_pose_ros.scoring import explain
 from hand_pose_ros.skeleton import Skeleton, get_skeleton
+from hand_pose_ros.smoothing import OneEuroFilter
 
 Side = Literal['left', 'right', 'unknown']
 
 RECENTER_M = 0.015
 """A cube whose centre is further than this from the middle of the joints it gave is moved there and read again."""
+FRAME_S = 1 / 30
+"""Time between images for smoothing, where the caller does not say."""
 SIDE_MEMORY = 0.9
 """What a hand has shown of its side fades by this factor each image: about ten images decide."""
 
@@ -63,6 +66,7 @@ class _Track:
     id: str
     center: tuple[float, float, float]
     rightness: float = 0.0  # > 0: has looked more like a right hand
+    filter: OneEuroFilter | None = None
 
 
 @dataclass(frozen=True)
@@ -89,6 +93,7 @@ class HandPoseEstimator:
         min_score: hands with a lower score are not reported.
         near, far: range in which hands are looked for, metres.
         tracking: look first where the hands of the last image were.
+        smoothing: cutoff in Hz of a filter on the joints of a tracked hand at rest (see `smoothing`); 0 = none.
     """
 
     engine: Engine
@@ -100,6 +105,7 @@ class HandPoseEstimator:
     near: float = 0.1
     far: float = 1.5
     tracking: bool = True
+    smoothing: float = 0.0
     metadata: dict[str, Any] = field(default_factory=dict)
     timings: dict[str, float] = field(default_factory=dict, init=False)
     """Seconds that each stage of the last image took: detect, crop, predict, uncrop."""
@@ -107,6 +113,7 @@ class HandPoseEstimator:
     def __post_init__(self) -> None:
         self._tracks: list[_Track] = []
         self._ids = count(1)
+        self._last_s: float | None = None
 
     @classmethod
     def from_pretrained(cls, model: str | PathLike[str] | None = None, *, device: str = 'auto',
@@ -130,13 +137,17 @@ class HandPoseEstimator:
     def reset(self) -> None:
         """Forget the hands of the last image."""
         self._tracks.clear()
+        self._last_s = None
 
-    def __call__(self, depth: NDArray[np.float32], intrinsics: Intrinsics) -> list[HandEstimate]:
-        """The hands in a depth image, the surest first among those newly found, tracked ones before them.
+    def __call__(self, depth: NDArray[np.float32], intrinsics: Intrinsics, *, time_s: float | None = None,
+                 regions: Sequence[Region] | None = None) -> list[HandEstimate]:
+        """The hands in a depth image: tracked ones first, then those newly found, nearest first.
 
         Args:
             depth: (H, W) float32 metres, 0 = no reading.
             intrinsics: of this very image.
+            time_s: when it was taken, for smoothing; without it, images are 1/30 s apart.
+            regions: look for new hands in these rectangles of the image (x, y, width, height) instead of everywhere.
 
         Raises:
             InputError: the image is of another type or size than described.
@@ -147,6 +158,9 @@ class HandPoseEstimator:
         intrinsics.check_size(depth.shape[1], depth.shape[0])
         self.timings = dict.fromkeys(('detect', 'crop', 'predict', 'uncrop'), 0.0)
 
+        dt = FRAME_S if time_s is None or self._last_s is None else time_s - self._last_s
+        self._last_s = time_s
+
         hands: list[HandEstimate] = []
         for track in list(self._tracks):
             cube = Cube(track.center, self.cube_side)
@@ -154,14 +168,14 @@ class HandPoseEstimator:
                 alive = holds_a_hand(depth, intrinsics, cube, near=self.near, far=self.far)
             reading = self._read(depth, intrinsics, cube, track) if alive else None
             if reading is not None and reading.score >= self.min_score and not _overlaps(reading.cube, hands):
-                hands.append(self._follow(track, reading))
+                hands.append(self._follow(track, reading, dt))
             else:
                 self._tracks.remove(track)
         if len(hands) < self.max_hands:
             with self._timed('detect'):
                 # Objects that prove to be no hand must not hide one behind them.
                 cubes = detect(depth, intrinsics, side=self.cube_side, near=self.near, far=self.far,
-                               max_hands=self.max_hands + 2)
+                               max_hands=self.max_hands + 2, regions=regions)
             for cube in cubes:
                 if len(hands) == self.max_hands:
                     break
@@ -172,9 +186,9 @@ class HandPoseEstimator:
                 if reading.score >= self.min_score and not _overlaps(reading.cube, hands):
                     track.id = f'hand_{next(self._ids)}'
                     self._tracks.append(track)
-                    hands.append(self._follow(track, reading))
+                    hands.append(self._follow(track, reading, dt))
         if not self.tracking:
-            self.reset()
+            self._tracks.clear()
         return hands
 
     def _read(self, depth: NDArray[np.float32], intrinsics: Intrinsics, cube: Cube, track: _Track) -> _Reading:
@@ -217,12 +231,17 @@ class HandPoseEstimator:
         score = np.array([score for _, score in judged], np.float32)
         return np.stack([confidence for confidence, _ in judged]), score, score
 
-    def _follow(self, track: _Track, reading: _Reading) -> HandEstimate:
+    def _follow(self, track: _Track, reading: _Reading, dt: float) -> HandEstimate:
         track.rightness = SIDE_MEMORY * track.rightness + reading.rightness
         center = reading.joints.mean(axis=0)
         track.center = (float(center[0]), float(center[1]), float(center[2]))
+        joints = reading.joints
+        if self.smoothing > 0:
+            if track.filter is None or track.filter.cutoff_hz != self.smoothing:
+                track.filter = OneEuroFilter(self.smoothing)
+            joints = track.filter(joints, dt)
         side: Side = self.side if self.side != 'auto' else 'right' if track.rightness >= 0 else 'left'
-        return HandEstimate(reading.joints.astype(np.float32), self.skeleton.joint_names, reading.confidence,
+        return HandEstimate(joints.astype(np.float32), self.skeleton.joint_names, reading.confidence,
                             reading.score, side, reading.cube, track.id)
 
     @contextmanager

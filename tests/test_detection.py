@@ -101,3 +101,13 @@ def test_every_annotated_real_hand_is_found(shared_data):
         marks = np.array([p for p in frame['points'].values() if p])
         whole += np.abs(cube.to_cube(camera.back_project(marks[:, :2], marks[:, 2] / 1000))).max() <= 1
     assert whole >= 27
+
+
+def test_regions_of_interest_replace_the_search(empty):
+    add_sphere(empty, (-0.1, 0, 0.6), 0.05)
+    add_sphere(empty, (0.2, 0, 0.9), 0.05)
+    u, v = CAMERA.project((0.2, 0, 0.9)).astype(int)
+    [cube] = detect(empty, CAMERA, regions=[(u - 60, v - 60, 120, 120)])
+    assert cube.center[2] == pytest.approx(0.87, abs=0.02)
+    assert detect(empty, CAMERA, regions=[(0, 0, 50, 50)]) == []
+    assert detect(empty, CAMERA, regions=[(-500, -500, 50, 50)]) == []

@@ -1,0 +1,42 @@
+"""The 1 euro filter: steady when the hand rests, quick when it moves (Casiez, Roussel, Vogel 2012)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+DERIVATIVE_CUTOFF_HZ = 1.0
+"""Of the low-pass filter on the speed, as in the paper."""
+
+
+class OneEuroFilter:
+    """A low-pass filter whose cutoff grows with the speed of what it filters.
+
+    Args:
+        cutoff_hz: at rest; lower is steadier.
+        gain: by how many Hz the cutoff grows per metre per second; higher lags less.
+    """
+
+    def __init__(self, cutoff_hz: float, gain: float = 30.0) -> None:
+        self.cutoff_hz, self.gain = cutoff_hz, gain
+        self._value: NDArray[np.float64] | None = None
+        self._speed = np.zeros(())
+
+    def __call__(self, value: NDArray[np.floating], dt: float) -> NDArray[np.float64]:
+        """Filter points (..., 3) in metres, `dt` seconds after the last ones; each point has a speed of its own."""
+        value = np.asarray(value, np.float64)
+        if self._value is None or dt <= 0:
+            self._value, self._speed = value, np.zeros((*value.shape[:-1], 1))
+            return value
+        speed = np.linalg.norm(value - self._value, axis=-1, keepdims=True) / dt
+        self._speed = self._speed + _share(DERIVATIVE_CUTOFF_HZ, dt) * (speed - self._speed)
+        self._value = self._value + _share(self.cutoff_hz + self.gain * self._speed, dt) * (value - self._value)
+        return self._value
+
+
+def _share(cutoff_hz: NDArray[np.float64] | float, dt: float) -> NDArray[np.float64] | float:
+    """How much of the new value a first-order low-pass filter takes."""
+    rate = 2 * math.pi * cutoff_hz * dt
+    return rate / (rate + 1)

@@ -228,8 +228,8 @@ def test_the_crop_is_centred_on_what_is_there():
 
 def test_synthetic_hands_are_right_hands_to_the_network():
     from hand_pose_ros.synthetic.generator import SyntheticHands
-    scene = SyntheticHands('val').batch(torch.arange(64))
-    seen = open_dataset('synthetic', 'val').batch(torch.arange(64))
+    scene = SyntheticHands('val').batch(torch.arange(16))
+    seen = open_dataset('synthetic', 'val').batch(torch.arange(16))
     left = scene['side'] == 1
     assert left.any() and not left.all()
     expected = scene['joints_m'].clone()

@@ -261,8 +261,8 @@ def test_a_wrong_override_is_one_sentence(override, message):
 # Runs
 
 def test_training_learns_and_leaves_a_folder_that_tells_all(folder, tmp_path):
-    run = tiny(folder, 'network=deep', 'optimizer=adamw', 'learning_rate=0.002', 'samples=1600', 'batch_size=16',
-               'val_every=800', 'options.dropout=0.0', recipe='paper', out=tmp_path)
+    run = tiny(folder, 'network=deep', 'optimizer=adamw', 'learning_rate=0.002', 'samples=960', 'batch_size=16',
+               'val_every=480', 'options.dropout=0.0', recipe='paper', out=tmp_path)
     first = run.train()
     # Twelve frames do not tell where scattered balls are in a new one, but those it was shown it knows.
     shown = load_checkpoint(tmp_path / 'last.safetensors')
@@ -272,8 +272,8 @@ def test_training_learns_and_leaves_a_folder_that_tells_all(folder, tmp_path):
     assert error < 25 < first['val_mm'] / 1.5
     assert shown.metadata['skeleton'] == 'icvl16' and shown.metadata['training_data'] == 'icvl-train'
     lines = [json.loads(line) for line in (tmp_path / 'metrics.jsonl').read_text().splitlines()]
-    assert [line['samples'] for line in lines if 'val_mm' in line] == [800, 1600]
-    assert lines[0]['joints'] > 1.1 * [line for line in lines if 'joints' in line][-1]['joints']
+    assert [line['samples'] for line in lines if 'val_mm' in line] == [480, 960]
+    assert [line['step'] for line in lines if 'joints' in line] == [50, 60]
     config = json.loads((tmp_path / 'config.json').read_text())
     assert recipe_from_dict(config['recipe']) == run.recipe and 'git' in config
     assert (tmp_path / 'best.safetensors').exists() and (tmp_path / 'log.txt').stat().st_size > 0
@@ -307,7 +307,7 @@ MODERN = ('network=hand_dense', 'options={}', 'options.width=8')
 
 @pytest.mark.parametrize('recipe', ['paper', 'original-code', 'modern'])
 def test_a_stopped_run_continues_bit_for_bit(folder, tmp_path, recipe):
-    overrides = ('samples=48', *(MODERN if recipe == 'modern' else ()))
+    overrides = ('samples=40', *(MODERN if recipe == 'modern' else ()))
     tiny(folder, *overrides, recipe=recipe, out=tmp_path / 'whole').train()
     run = tiny(folder, *overrides, recipe=recipe, out=tmp_path / 'stopped')
     step, train_step = [], run._train_step

@@ -244,7 +244,7 @@ class Run:
 
     def _fail(self, batch: Batch, terms: dict[str, Tensor]) -> None:
         path = self.folder.path / f'failed_batch_{self.step}_{self.rank}.safetensors'
-        values = {name: str(float(value)) for name, value in terms.items()}
+        values = {name: str(value.item()) for name, value in terms.items()}
         save_tensors(path, batch, {'step': self.step, 'terms': values})
         raise TrainingError(f'the loss of step {self.step} is not finite ({values}); the batch is in {path}. If it '
                             f'looks right, train anew with a learning_rate below {self.recipe.learning_rate}')

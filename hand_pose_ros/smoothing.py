@@ -22,18 +22,19 @@ class OneEuroFilter:
     def __init__(self, cutoff_hz: float, gain: float = 30.0) -> None:
         self.cutoff_hz, self.gain = cutoff_hz, gain
         self._value: NDArray[np.float64] | None = None
-        self._speed = np.zeros(())
+        self._speed: NDArray[np.float64] = np.zeros(())
 
-    def __call__(self, value: NDArray[np.floating], dt: float) -> NDArray[np.float64]:
+    def __call__(self, value: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
         """Filter points (..., 3) in metres, `dt` seconds after the last ones; each point has a speed of its own."""
-        value = np.asarray(value, np.float64)
-        if self._value is None or dt <= 0:
+        last = self._value
+        if last is None or dt <= 0:
             self._value, self._speed = value, np.zeros((*value.shape[:-1], 1))
             return value
-        speed = np.linalg.norm(value - self._value, axis=-1, keepdims=True) / dt
+        speed = np.linalg.norm(value - last, axis=-1, keepdims=True) / dt
         self._speed = self._speed + _share(DERIVATIVE_CUTOFF_HZ, dt) * (speed - self._speed)
-        self._value = self._value + _share(self.cutoff_hz + self.gain * self._speed, dt) * (value - self._value)
-        return self._value
+        filtered: NDArray[np.float64] = last + _share(self.cutoff_hz + self.gain * self._speed, dt) * (value - last)
+        self._value = filtered
+        return filtered
 
 
 def _share(cutoff_hz: NDArray[np.float64] | float, dt: float) -> NDArray[np.float64] | float:

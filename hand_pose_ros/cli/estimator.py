@@ -34,5 +34,8 @@ def run(args: argparse.Namespace) -> int:
         from hand_pose_ros.ros.params import markdown_table
         print(markdown_table())
         return 0
-    from hand_pose_ros.ros.node import main
-    return main(['--ros-args', *args.ros_args])
+    try:
+        from hand_pose_ros.ros.node import main
+        return main(['--ros-args', *args.ros_args])
+    except KeyboardInterrupt:  # while it was loading
+        return 0

@@ -197,6 +197,7 @@ def test_half_precision_changes_no_joint_by_half_a_millimetre(architecture, refi
     assert_equal_in_half_precision(answer.numpy(), expected.numpy(), architecture)
 
 
+@pytest.mark.timeout(300)  # nine seconds of CPU time, whatever else the machine does
 def test_bench_measures_every_kind_of_row(tmp_path, capsys):
     file = tmp_path / "speed.json"
     assert main(["bench", "--quick", "--threads", "1", "--json", str(file)]) == 0

@@ -588,13 +588,14 @@ def test_the_command_starts_and_ends_cleanly(rig: Rig) -> None:
         [*COMMAND, 'estimator', '--ros-args', '-p', f'model:={rig.weights}',
          '-p', 'min_score:=0.0'], stderr=subprocess.PIPE, text=True, env=dict(os.environ))
     try:
+        rig.until(lambda: rig.client.count_publishers('/hand/joints'), 'the node', seconds=90)
         publish = rig.camera(info=camera_info())
         while not rig.received[HandJointsArray]:
             publish(image(depth_with_hand()))
             assert process.poll() is None
             time.sleep(0.05)
         process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=20)
+        _, errors = process.communicate(timeout=60)
     finally:
         process.kill()
     assert process.returncode == 0
@@ -603,7 +604,7 @@ def test_the_command_starts_and_ends_cleanly(rig: Rig) -> None:
 
 def test_a_wrong_parameter_at_start_is_one_sentence() -> None:
     done = subprocess.run([*COMMAND, 'estimator', '--ros-args', '-p', 'depth_scale:=7.0'],
-                          capture_output=True, text=True, timeout=60)
+                          capture_output=True, text=True, timeout=100)
     assert done.returncode == 1
     assert 'depth_scale' in done.stderr and 'Traceback' not in done.stderr
 

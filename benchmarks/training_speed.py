@@ -33,7 +33,7 @@ def training(network: str, recipe_name: str, precision: torch.dtype | None) -> f
     """Steps of a recipe on samples that are there already."""
     recipe = get_recipe(recipe_name)
     module = build(network, joints=21, **({} if network == 'hand_dense' else {'bottleneck': 30}))
-    objective = DenseObjective(module, recipe, HAND21) if network == 'hand_dense' else PoseObjective(module, recipe)
+    objective = (DenseObjective if network == 'hand_dense' else PoseObjective)(module, recipe, HAND21)
     objective.train().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = make_optimizer(recipe, objective)
     numbers = torch.arange(recipe.batch_size)

@@ -415,6 +415,18 @@ def test_a_refiner_learns_from_what_its_base_has_not_seen(folder, tmp_path):
         tiny(folder, 'refiner=or_ref', out=tmp_path / 'never')
 
 
+def test_the_center_refiner_learns_where_the_palm_is(folder, tmp_path):
+    run = tiny(folder, 'network=center_refiner', 'options={}', 'options.dropout=0.0', 'optimizer=adamw',
+               'learning_rate=0.001', 'samples=600', out=tmp_path)
+    run.train()
+    network = load_checkpoint(tmp_path / 'last.safetensors').network
+    batch = run.shards.read(0)
+    palm = batch['joints'][:, 0]  # of icvl16
+    with torch.no_grad():
+        error = (network(batch['patch'].float()) - palm).norm(dim=-1).mean()
+    assert error < 0.5 * (palm - palm.mean(0)).norm(dim=-1).mean()
+
+
 def test_the_heads_of_a_dense_network_are_trained_for_what_they_say():
     """Each term falls when its head is right, and joints of mirrored or absent hands teach nothing."""
     torch.manual_seed(0)
@@ -424,17 +436,17 @@ def test_the_heads_of_a_dense_network_are_trained_for_what_they_say():
     batch = sample()
     batch = {**batch, 'joints': batch['joints'][:, :21], 'mirrored': torch.tensor([False, False, True, False]),
              'hand_present': torch.tensor([True, True, True, False])}
-    before = {key: float(value) for key, value in objective(batch).items()}
+    before = {key: value.item() for key, value in objective(batch).items()}
     optimizer = torch.optim.Adam(objective.parameters(), 0.01)
     for _ in range(40):
         optimizer.zero_grad()
         sum(objective(batch).values()).backward()
         optimizer.step()
-    after = {key: float(value) for key, value in objective(batch).items()}
+    after = {key: value.item() for key, value in objective(batch).items()}
     assert before.keys() == after.keys() == {'joints', 'maps', 'confidence', 'hand', 'side', 'size'}
     assert all(after[key] < before[key] for key in after)
     changed = {**batch, 'joints': torch.where(torch.tensor([0, 0, 1, 1])[:, None, None] > 0, 9.0, batch['joints'])}
-    assert {key: float(value) for key, value in objective(changed).items()} == after
+    assert {key: value.item() for key, value in objective(changed).items()} == after
 
 
 def test_experiments_train_what_is_missing_and_write_table_plot_and_json(folder, tmp_path, monkeypatch):

@@ -28,7 +28,7 @@ from hand_pose_ros.models.checkpoints import Checkpoint, load_checkpoint, save_c
 from hand_pose_ros.models.prior import fit_prior
 from hand_pose_ros.training.augmentation import augment
 from hand_pose_ros.training.folder import RunFolder, TrainingError
-from hand_pose_ros.training.objectives import DenseObjective, PoseObjective, RefinerObjective
+from hand_pose_ros.training.objectives import CenterObjective, DenseObjective, PoseObjective, RefinerObjective
 from hand_pose_ros.training.optimizers import learning_rate, make_optimizer
 from hand_pose_ros.training.recipes import EPOCH_OF_ENDLESS_DATA, Recipe, recipe_to_dict
 from hand_pose_ros.training.state import load_state, save_state, save_tensors
@@ -123,8 +123,9 @@ class Run:
         if recipe.refiner:
             if base is None:
                 raise TrainingError('a refiner needs the checkpoint that it corrects: --set base=FILE')
-            return RefinerObjective(build(recipe.refiner, joints=joints), base.network, recipe)
-        network = build(recipe.network, joints=joints, **recipe.options)
+            return RefinerObjective(build(recipe.refiner, joints=joints), base.network, recipe, self.skeleton)
+        center = recipe.network == 'center_refiner'
+        network = build(recipe.network, **({} if center else {'joints': joints}), **recipe.options)
         bottleneck = recipe.options.get('bottleneck')
         if base is not None:
             self._start_from(network, base)
@@ -134,9 +135,8 @@ class Run:
             log.info('the prior keeps %.2f %% of the variance of the poses', 100 * prior.explained_variance_ratio.sum())
         if bottleneck and not recipe.train_prior:
             network.head.reconstruction.requires_grad_(False)  # type: ignore[union-attr]
-        if hasattr(network, 'forward_full'):
-            return DenseObjective(network, recipe, self.skeleton)
-        return PoseObjective(network, recipe)
+        kind = CenterObjective if center else DenseObjective if hasattr(network, 'forward_full') else PoseObjective
+        return kind(network, recipe, self.skeleton)
 
     def _start_from(self, network: nn.Module, base: Checkpoint) -> None:
         try:
@@ -274,7 +274,8 @@ class Run:
         """Mean error on identities that training does not see, by rank 0; the best network so far is kept."""
         if self.rank:
             return {}
-        estimates, truths = estimate(self.averaged.eval().predict, self._validation, self.device)
+        objective = self.averaged.eval()
+        estimates, truths = estimate(objective.predict, self._validation, self.device, objective.joints)
         errors = 1000 * (estimates - truths).norm(dim=-1)
         within = {f'val_within_{mm}': round(float((errors.amax(1) <= mm).float().mean()), 4) for mm in (20, 30, 40)}
         result = {'val_mm': round(float(errors.mean()), 3), **within}

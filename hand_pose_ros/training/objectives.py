@@ -19,17 +19,32 @@ from hand_pose_ros.training.recipes import Recipe
 class PoseObjective(nn.Module):
     """A network that predicts joints."""
 
-    def __init__(self, network: nn.Module, recipe: Recipe) -> None:
+    def __init__(self, network: nn.Module, recipe: Recipe, skeleton: Skeleton) -> None:
         super().__init__()
         self.network, self.recipe = network, recipe
+        self.joints = list(range(len(skeleton)))
+        """Which of the skeleton are predicted."""
 
     def forward(self, batch: Batch) -> Terms:
-        joints = self.network(batch['patch']).float()
-        return {'joints': joint_loss(self.recipe.loss, self.recipe.knee, joints, batch['joints'], _counts(batch))}
+        joints, truth = self.predict(batch['patch']).float(), batch['joints'][:, self.joints]
+        return {'joints': joint_loss(self.recipe.loss, self.recipe.knee, joints, truth, _counts(batch))}
 
     def predict(self, patch: Tensor) -> Tensor:
         """(B, 1, 128, 128) -> joints (B, J, 3) in cube units, after training."""
         return self.network(patch)
+
+
+class CenterObjective(PoseObjective):
+    """A network that says where in the cube the palm is (DeepPrior++), to centre the cube there."""
+
+    PALMS = ('palm', 'middle_mcp')
+
+    def __init__(self, network: nn.Module, recipe: Recipe, skeleton: Skeleton) -> None:
+        super().__init__(network, recipe, skeleton)
+        self.joints = [next(skeleton.joint_names.index(name) for name in self.PALMS if name in skeleton.joint_names)]
+
+    def predict(self, patch: Tensor) -> Tensor:
+        return self.network(patch)[:, None]
 
 
 _WEIGHTS = {'maps': 1.0, 'confidence': 0.01, 'hand': 0.01, 'side': 0.01, 'size': 0.01}
@@ -50,7 +65,7 @@ class DenseObjective(PoseObjective):
     """Metres."""
 
     def __init__(self, network: nn.Module, recipe: Recipe, skeleton: Skeleton) -> None:
-        super().__init__(network, recipe)
+        super().__init__(network, recipe, skeleton)
         self.middle_finger = _chain(skeleton)
 
     def forward(self, batch: Batch) -> Terms:
@@ -91,9 +106,10 @@ class RefinerObjective(nn.Module):
     JITTER = 0.03
     """Standard deviation, cube units (4.5 mm in a cube of 0.3 m)."""
 
-    def __init__(self, refiner: nn.Module, base: nn.Module, recipe: Recipe) -> None:
+    def __init__(self, refiner: nn.Module, base: nn.Module, recipe: Recipe, skeleton: Skeleton) -> None:
         super().__init__()
         self.refiner, self.recipe = refiner, recipe
+        self.joints = list(range(len(skeleton)))
         self._base = [base.eval().requires_grad_(False)]  # in a list: no part of what is trained, saved or averaged
 
     def forward(self, batch: Batch) -> Terms:

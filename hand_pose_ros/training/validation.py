@@ -25,11 +25,12 @@ def first_samples(shards: DiskShards | MemoryShards, count: int) -> list[Batch]:
 
 @torch.no_grad()
 def estimate(predict: Callable[[Tensor], Tensor], batches: Iterable[Batch], device: torch.device,
-             batch_size: int = 256) -> tuple[Tensor, Tensor]:
+             joints: list[int] | slice = slice(None), batch_size: int = 256) -> tuple[Tensor, Tensor]:
     """Estimated and true joints (N, J, 3) in metres of the samples that show a hand.
 
     Args:
         predict: patches (B, 1, 128, 128) -> joints (B, J, 3) in cube units.
+        joints: those of the skeleton that are predicted.
     """
     estimates, truths = [], []
     for whole in batches:
@@ -37,5 +38,5 @@ def estimate(predict: Callable[[Tensor], Tensor], batches: Iterable[Batch], devi
             batch = {key: value[start:start + batch_size].to(device) for key, value in whole.items()}
             present, cube = batch['hand_present'], (batch['cube_center'], batch['cube_side'])
             estimates.append(joints_in_metres(predict(batch['patch'].float()).float(), *cube)[present].cpu())
-            truths.append(joints_in_metres(batch['joints'], *cube)[present].cpu())
+            truths.append(joints_in_metres(batch['joints'][:, joints], *cube)[present].cpu())
     return torch.cat(estimates), torch.cat(truths)

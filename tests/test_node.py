@@ -372,6 +372,21 @@ def test_parameters_change_between_images_or_are_refused_with_the_reason(rig: Ri
     assert rig.answer(publish, image(depth_with_hand())).hands
 
 
+def test_smoothing_holds_a_hand_still_that_jumps(rig: Rig) -> None:
+    rig.start(smoothing=0.5)
+    publish = rig.camera(info=camera_info())
+    tip = HAND21.joint_names.index('index_tip')
+
+    def jump() -> float:
+        before, after = (rig.answer(publish, image(depth_with_hand(z), stamp)).hands[0].joints[tip].z
+                         for z, stamp in ((0.6, 1000), (0.62, 1033)))
+        return abs(after - before)
+
+    smooth = jump()
+    assert rig.set_parameter('smoothing', 0.0)[0]
+    assert smooth < 0.5 * jump()
+
+
 def test_without_camera_info_the_remedy_is_named_and_works(rig: Rig) -> None:
     rig.start(camera_info_timeout=0.05)
     publish = rig.camera()

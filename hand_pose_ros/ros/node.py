@@ -269,7 +269,7 @@ class EstimatorNode(LifecycleNode):
         self._last_header = image.header
         if problem := self._camera.frame_problem(image.header.frame_id, params):
             self._complain(f'{topic}: {problem}')
-        hands = estimator(depth, intrinsics)
+        hands = estimator(depth, intrinsics, time_s=stamp_ns(image.header) / 1e9)
         self._statistics.time(**estimator.timings)
         if not hands and (problem := depth_problem(depth, params.min_depth, params.max_depth)):
             self._complain(f'{topic}: {problem}')

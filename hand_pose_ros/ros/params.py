@@ -59,6 +59,8 @@ class Params:
     max_hands: int = _parameter(1, 'At most this many hands per image.', low=1, high=8)
     min_score: float = _parameter(0.3, 'Hands with a lower score are not reported.', low=0.0, high=1.0)
     tracking: bool = _parameter(True, 'Look first where the hands of the last image were.')
+    smoothing: float = _parameter(0.0, 'Cutoff in Hz of the filter on the joints of a hand at rest; 0 = none.',
+                                  low=0.0, high=30.0)
     publish_markers: bool = _parameter(True, 'Publish hand/markers (only built while somebody listens).')
     marker_lifetime: float = _parameter(0.5, 'Seconds after which a viewer removes the markers of a node that died; '
                                         '0 = never. Lost hands are deleted at once.', low=0.0, high=60.0)
@@ -99,7 +101,7 @@ class Params:
         estimator.min_score = self.min_score
         estimator.near, estimator.far = self.min_depth, self.max_depth
         estimator.cube_side = self.cube_size or estimator.metadata['cube_side']
-        estimator.tracking = self.tracking
+        estimator.tracking, estimator.smoothing = self.tracking, self.smoothing
 
 
 def ros_name(row: Any) -> str:

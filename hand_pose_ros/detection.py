@@ -6,7 +6,9 @@ detector is kept, with sizes in metres instead of pixels, no bias at the border 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import islice
+from typing import Any
 
 import cv2
 import numpy as np
@@ -66,9 +68,9 @@ class _Scene:
         return np.array([x * depth, y * depth, depth])
 
 
-def detect(depth: NDArray[np.float32], intrinsics: Intrinsics, *, side: float = 0.30, near: float = 0.1,
-           far: float = 1.5, max_hands: int = 1, regions: Sequence[Region] | None = None) -> list[Cube]:
-    """Cubes around the nearest hand-sized objects, nearest first; empty when there is none.
+def candidates(depth: NDArray[np.float32], intrinsics: Intrinsics, *, side: float = 0.30, near: float = 0.1,
+               far: float = 1.5, regions: Sequence[Region] | None = None) -> Iterator[Cube]:
+    """Cubes around hand-sized objects, nearest first, each searched only when it is asked for.
 
     Starting at the camera, everything nearer than a growing distance is looked at. The first connected piece of at
     least MIN_AREA_M2 starts a cube, which moves to the centre of mass of what it holds (5 iterations, as the original
@@ -91,7 +93,7 @@ def detect(depth: NDArray[np.float32], intrinsics: Intrinsics, *, side: float = 
     z, unseen = scene.z, scene.z > 0
     present = z[unseen]
     if present.size == 0:
-        return found
+        return
     for limit in np.arange(present.min() + _SLAB_M, present.max() + 2 * _SLAB_M, _SLAB_M):
         nearer = (unseen & (z < limit)).view(np.uint8)
         count, labels, stats, _ = cv2.connectedComponentsWithStats(nearer, connectivity=4)
@@ -106,13 +108,16 @@ def detect(depth: NDArray[np.float32], intrinsics: Intrinsics, *, side: float = 
             again = any(np.linalg.norm(center - cube.center) < side / 3 for cube in found)
             if not again and _may_hold_a_hand(scene, center, side):
                 found.append(Cube((float(center[0]), float(center[1]), float(center[2])), side))
+                yield found[-1]
             # Whatever it was, it has been judged: look behind and beside it.
             _, inside, rows, cols = scene.inside(center, side)
             unseen[rows, cols] &= ~inside
             unseen[piece] = False
-            if len(found) == max_hands:
-                return found
-    return found
+
+
+def detect(depth: NDArray[np.float32], intrinsics: Intrinsics, *, max_hands: int = 1, **where: Any) -> list[Cube]:
+    """The first `max_hands` of the `candidates`, which take the other arguments; empty when there are none."""
+    return list(islice(candidates(depth, intrinsics, **where), max_hands))
 
 
 def _settle(scene: _Scene, center: NDArray[np.float64], side: float) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hand_pose_ros.detection import Region, detect, holds_a_hand
+from hand_pose_ros.detection import Region, candidates, holds_a_hand
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.geometry import Cube, Intrinsics, crop
 from hand_pose_ros.models.checkpoints import load_checkpoint
@@ -30,6 +30,8 @@ Side = Literal['left', 'right', 'unknown']
 
 RECENTER_M = 0.015
 """A cube whose centre is further than this from the middle of the joints it gave is moved there and read again."""
+FALSE_ALARMS = 2
+"""How many objects that are no hand are looked at in an image before the search is given up."""
 FRAME_S = 1 / 30
 """Time between images for smoothing, where the caller does not say."""
 SIDE_MEMORY = 0.9
@@ -172,17 +174,17 @@ class HandPoseEstimator:
             else:
                 self._tracks.remove(track)
         if len(hands) < self.max_hands:
-            with self._timed('detect'):
-                # Objects that prove to be no hand must not hide one behind them.
-                cubes = detect(depth, intrinsics, side=self.cube_side, near=self.near, far=self.far,
-                               max_hands=self.max_hands + 2, regions=regions)
-            for cube in cubes:
-                if len(hands) == self.max_hands:
+            cubes = candidates(depth, intrinsics, side=self.cube_side, near=self.near, far=self.far, regions=regions)
+            # Objects that prove to be no hand must not hide one behind them, nor cost time without end.
+            for _ in range(self.max_hands + FALSE_ALARMS):
+                with self._timed('detect'):
+                    found = next(cubes, None) if len(hands) < self.max_hands else None
+                if found is None:
                     break
-                if _overlaps(cube, hands):
+                if _overlaps(found, hands):
                     continue
-                track = _Track(id='', center=cube.center)
-                reading = self._read(depth, intrinsics, cube, track)
+                track = _Track(id='', center=found.center)
+                reading = self._read(depth, intrinsics, found, track)
                 if reading.score >= self.min_score and not _overlaps(reading.cube, hands):
                     track.id = f'hand_{next(self._ids)}'
                     self._tracks.append(track)

@@ -135,8 +135,8 @@ def crop(depth: NDArray[np.float32], cube: Cube, intrinsics: Intrinsics, size: i
     cv2.warpAffine(depth, affine, (size, size), dst=patch, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
                    borderMode=cv2.BORDER_CONSTANT, borderValue=0)
     nothing = patch == 0
+    np.clip(patch, z - half, z + half, out=patch)  # before the division: a reading may be any float
     patch -= z
     patch /= half
-    np.clip(patch, -1, 1, out=patch)
     patch[nothing] = 1
-    return patch[None]
+    return np.clip(patch, -1, 1, out=patch)[None]

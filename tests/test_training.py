@@ -331,6 +331,7 @@ def command(folder: Path, out: Path, *overrides: str) -> list[str]:
     return ['train', 'paper', '--out', str(out), '--cache', str(folder / 'cache'), '--threads', '1', *sets]
 
 
+@pytest.mark.timeout(600)
 def test_a_killed_run_continues_bit_for_bit(folder, tmp_path):
     """SIGKILL at any moment, with samples made by another process, which must not outlive the run."""
     script = ('import sys, hand_pose_ros.training.loop as loop; from functools import partial;'
@@ -371,15 +372,16 @@ def stop_after(run: Run, step: int) -> None:
     run._train_step = stopping
 
 
+@pytest.mark.timeout(600)
 def test_two_processes_give_the_result_of_one(folder, tmp_path):
     overrides = ('samples=40', 'network=multi_scale', 'options.dropout=0.0', 'augmentation=modern')
     script = 'import sys; from hand_pose_ros.cli import main; sys.exit(main(sys.argv[1:]))'
     torchrun = [sys.executable, '-m', 'torch.distributed.run', '--standalone', '--nproc-per-node', '2']
-    arguments = command(folder, tmp_path / 'two', *overrides)
-    result = subprocess.run([*torchrun, '--no-python', sys.executable, '-c', script, *arguments], timeout=110,
+    arguments = [*command(folder, tmp_path / 'two', *overrides), '--workers', '0']
+    result = subprocess.run([*torchrun, '--no-python', sys.executable, '-c', script, *arguments], timeout=550,
                             text=True, capture_output=True, env={**os.environ, 'OMP_NUM_THREADS': '1'})
     assert result.returncode == 0, result.stderr
-    assert main(command(folder, tmp_path / 'one', *overrides)) == 0
+    assert main([*command(folder, tmp_path / 'one', *overrides), '--workers', '0']) == 0
     one, two = (load_file(tmp_path / name / 'state.safetensors') for name in ('one', 'two'))
     for key, value in one.items():
         torch.testing.assert_close(two[key], value, atol=1e-5, rtol=1e-4)
@@ -449,6 +451,7 @@ def test_the_heads_of_a_dense_network_are_trained_for_what_they_say():
     assert {key: value.item() for key, value in objective(changed).items()} == after
 
 
+@pytest.mark.timeout(600)
 def test_experiments_train_what_is_missing_and_write_table_plot_and_json(folder, tmp_path, monkeypatch):
     monkeypatch.setattr(experiments, 'WIDTHS', (None, 8, 30))
     monkeypatch.setattr(experiments, 'ITERATIONS', 2)

@@ -15,7 +15,7 @@ EPILOG = """examples:
   hand-pose train --out runs/modern --resume
   torchrun --standalone --nproc-per-node 4 --no-python hand-pose train modern --out runs/m --device cuda --workers 0
 
-recipes: paper, original-code, modern; docs/training.md says what they do and lists every value.
+recipes: paper, original-code, modern. docs/training.md says what they do, training/recipes.py lists the keys.
 """
 
 

@@ -35,19 +35,20 @@ class Furnisher:
     @staticmethod
     def _ellipsoid(to: list[Solid], samples: Tensor, center: Tensor, axes: Tensor, radii: Tensor) -> None:
         center, axes, radii = center[samples], axes[samples], radii[samples]
-        to.append(Solid(renderer.ellipsoid, samples, (center, axes, radii), center, radii.amax(1)))
+        to.append(Solid(renderer.ellipsoid, samples, (center, axes, radii), center[:, None],
+                        radii.amax(1, keepdim=True)))
 
     @staticmethod
     def _box(to: list[Solid], samples: Tensor, center: Tensor, axes: Tensor, half: Tensor) -> None:
         center, axes, half = center[samples], axes[samples], half[samples]
-        to.append(Solid(renderer.box, samples, (center, axes, half), center, dot(half, half).sqrt()))
+        to.append(Solid(renderer.box, samples, (center, axes, half), center[:, None],
+                        dot(half, half).sqrt()[:, None]))
 
     @staticmethod
     def _cone(to: list[Solid], samples: Tensor, start: Tensor, end: Tensor, radius: Tensor, end_radius: Tensor) -> None:
         start, end, radius, end_radius = start[samples], end[samples], radius[samples], end_radius[samples]
-        along = end - start
-        to.append(Solid(renderer.round_cone, samples, (start, end, radius, end_radius), (start + end) / 2,
-                        dot(along, along).sqrt() / 2 + torch.maximum(radius, end_radius)))
+        to.append(Solid(renderer.round_cone, samples, (start, end, radius, end_radius),
+                        torch.stack([start, end], 1), torch.stack([radius, end_radius], 1)))
 
     def surface(self) -> None:
         """A table under the hand or a wall behind it: a plane that arm and hand touch or stay clear of."""

@@ -42,7 +42,7 @@ class SyntheticHands:
         sensors: names of the sensors to draw from, equally often; all by default.
         ingredients: see Ingredients.
         hand: whose skin; the parametric hand by default, else for example a `rig.Rig`.
-        chunk: samples worked on at a time; bounds memory, does not change any sample.
+        chunk: samples worked on at a time (on a GPU better some thousands); does not change any sample.
 
     Raises:
         HandPoseError: an unknown split or sensor.

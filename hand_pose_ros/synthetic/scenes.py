@@ -42,24 +42,27 @@ class Solid:
         draw: of `renderer`; its arguments are the measures and a view.
         samples: (K,) that contain it.
         measures: each (K, ...).
-        center, radius: (K, 3), (K,) of a ball around it, or None where there is no end to it.
+        balls, radii: (K, N, 3), (K, N) of N balls, whose hull holds it; None where there is no end to it.
     """
 
     draw: Callable[..., Tensor]
     samples: Tensor
     measures: tuple[Tensor, ...]
-    center: Tensor | None = None
-    radius: Tensor | None = None
+    balls: Tensor | None = None
+    radii: Tensor | None = None
 
     def within(self, view: View, back: Tensor) -> Solid:
         """Those of it that may be seen in the `view` before the distance `back` (B,)."""
-        if self.center is None or self.radius is None:
+        if self.balls is None or self.radii is None:
             return self
         view, back = view[self.samples], back[self.samples]
-        (u, v), r = view.project(self.center[:, None]), self.radius
-        reach = torch.maximum(view.fx, view.fy) * r * 1.5 / (self.center[:, 2] - r).clamp(min=0.05)
-        seen = ((self.center[:, 2] - r < back) & (u[:, 0] > -reach) & (u[:, 0] < view.width + reach)
-                & (v[:, 0] > -reach) & (v[:, 0] < view.height + reach)).nonzero()[:, 0]
+        u, v = view.project(self.balls)
+        nearest = self.balls[..., 2] - self.radii
+        reach = torch.maximum(view.fx, view.fy)[:, None] * self.radii * 1.5 / nearest.clamp(min=0.05)
+        beside = torch.stack([u < -reach, u > view.width + reach, v < -reach, v > view.height + reach,
+                              nearest > back[:, None]])
+        # Beside the window on one side with all its balls. (Those near the camera's plane project anywhere.)
+        seen = (~beside.all(2).any(0) | (nearest < 0.05).any(1)).nonzero()[:, 0]
         return Solid(self.draw, self.samples[seen], tuple(m[seen] for m in self.measures))
 
 

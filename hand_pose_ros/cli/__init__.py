@@ -24,6 +24,7 @@ VERBS = {
     'experiment': 'repeat an experiment of the paper',
     'synth': 'make or show synthetic depth hands',
     'bench': 'measure speed on this machine',
+    'doctor': 'what is installed, whether it works, and what to do where it does not',
 }
 
 

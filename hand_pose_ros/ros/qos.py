@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 
+from rclpy import get_rmw_implementation_identifier
 from rclpy.qos import (
     QoSDurabilityPolicy,
     QoSHistoryPolicy,
@@ -40,7 +41,12 @@ def policy_name(kind: int) -> str:
     return str(qos_policy_name_from_kind(kind)).lower()
 
 
-_PROFILE_VARIABLES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')  # the second up to Jazzy
+PROFILE_VARIABLES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')  # the second up to Jazzy
+
+
+def middleware() -> str:
+    """Name of the middleware in use, such as rmw_fastrtps_cpp; the profile is for that one alone."""
+    return str(get_rmw_implementation_identifier())
 
 
 def large_image_profile() -> tuple[str, str]:
@@ -49,11 +55,11 @@ def large_image_profile() -> tuple[str, str]:
     Only who publishes images needs it: the shared memory that an image must fit into is the publisher's. Without it a
     VGA depth image is larger than all of it, and most are lost on the way to a best-effort subscriber.
     """
-    name = _PROFILE_VARIABLES[os.environ.get('ROS_DISTRO') in ('humble', 'iron', 'jazzy')]
+    name = PROFILE_VARIABLES[os.environ.get('ROS_DISTRO') in ('humble', 'iron', 'jazzy')]
     return name, str(resource('config/fastdds_large_images.xml'))
 
 
 def let_large_images_through() -> None:
     """Choose that profile for this process, unless the user has chosen one; call it before rclpy.init()."""
-    if not any(name in os.environ for name in _PROFILE_VARIABLES):
+    if not any(name in os.environ for name in PROFILE_VARIABLES):
         os.environ.update([large_image_profile()])

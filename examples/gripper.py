@@ -1,0 +1,67 @@
+#!/usr/bin/env python3
+"""Open and close a gripper as the hand opens and closes: finger angles to the command of a ros2_control gripper.
+
+    python examples/gripper.py --ros-args -r gripper/commands:=/gripper_controller/commands -p max_opening:=0.08
+
+The command is the opening in metres, as a forward_command_controller takes it. Without a hand that can be trusted the
+gripper stays as it is.
+"""
+
+import numpy as np
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from std_msgs.msg import Float64MultiArray
+
+from hand_pose_ros.angles import ANGLES, finger_angles
+from hand_pose_ros.msg import HandJoints, HandJointsArray
+
+SIDES = {HandJoints.LEFT: 'left', HandJoints.RIGHT: 'right'}
+PIP = [ANGLES.index(f'{finger}_pip_flexion') for finger in ('index', 'middle', 'ring', 'pinky')]
+FIST_RAD = 1.4
+"""The middle joint of a finger in a fist is bent by at least this much."""
+MIN_SCORE = 0.5
+SPEED = 0.2
+"""Metres per second at most: one wrong estimate must not slam the gripper."""
+
+
+def closing(joints: np.ndarray, side: str) -> float:
+    """Joints hand21 (21, 3) -> 0 for an open hand, 1 for a fist; the median finger decides."""
+    return float(np.clip(np.median(finger_angles(joints, side)[PIP]) / FIST_RAD, 0, 1))
+
+
+class Gripper(Node):
+    def __init__(self) -> None:
+        super().__init__('gripper')
+        self.max_opening = self.declare_parameter('max_opening', 0.08).value
+        self.opening, self.moved = None, self.get_clock().now()
+        self.commands = self.create_publisher(Float64MultiArray, 'gripper/commands', 10)
+        self.create_subscription(HandJointsArray, 'hand/joints', self.on_hands, 10)
+
+    def on_hands(self, message: HandJointsArray) -> None:
+        hand = max(message.hands, key=lambda hand: hand.score, default=None)
+        if hand is None or hand.score < MIN_SCORE or hand.side not in SIDES:
+            return
+        joints = np.array([(point.x, point.y, point.z) for point in hand.joints])
+        wanted = self.max_opening * (1 - closing(joints, SIDES[hand.side]))
+        now = self.get_clock().now()
+        reach = SPEED * min((now - self.moved).nanoseconds / 1e9, 0.1)
+        if self.opening is None:
+            self.opening = wanted
+        self.opening = float(np.clip(wanted, self.opening - reach, self.opening + reach))
+        self.moved = now
+        self.commands.publish(Float64MultiArray(data=[self.opening]))
+
+
+def main() -> None:
+    rclpy.init()
+    try:
+        rclpy.spin(Gripper())
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        rclpy.try_shutdown()
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,47 @@
+#!/usr/bin/env python3
+"""Print where the tip of the index finger is, as the node says it.
+
+    ros2 run hand_pose_ros estimator         # or: hand-pose estimator
+    python examples/subscribe.py
+"""
+
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+
+from hand_pose_ros.msg import HandJoints, HandJointsArray
+from hand_pose_ros.skeleton import HAND21
+
+INDEX_TIP = HAND21.joint_names.index('index_tip')
+SIDES = {HandJoints.LEFT: 'left', HandJoints.RIGHT: 'right', HandJoints.UNKNOWN: 'unknown'}
+
+
+class Listener(Node):
+    """Listens to hand/joints; remap it with --ros-args -r hand/joints:=/your/hand/joints."""
+
+    def __init__(self) -> None:
+        super().__init__('listener')
+        self.create_subscription(HandJointsArray, 'hand/joints', self.on_hands, 10)
+
+    def on_hands(self, message: HandJointsArray) -> None:
+        """Every image is answered; one without a hand has an empty list."""
+        if not message.hands:
+            print('no hand', flush=True)
+        for hand in message.hands:
+            tip = hand.joints[INDEX_TIP]  # metres, in the frame message.header.frame_id: x right, y down, z forward
+            print(f'{hand.id} {SIDES[hand.side]:<7} index tip at {tip.x:+.3f} {tip.y:+.3f} {tip.z:.3f} m, '
+                  f'confidence {hand.confidence[INDEX_TIP]:.2f}', flush=True)
+
+
+def main() -> None:
+    rclpy.init()
+    try:
+        rclpy.spin(Listener())
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        rclpy.try_shutdown()
+
+
+if __name__ == '__main__':
+    main()

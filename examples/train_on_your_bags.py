@@ -1,0 +1,56 @@
+#!/usr/bin/env python3
+"""Train a small, fast network for your own camera on your own bags.
+
+    python examples/train_on_your_bags.py --train monday.mcap tuesday.mcap --val wednesday.mcap --out my_network \\
+        --set augmentation=modern --set samples=500_000
+    hand-pose estimate thursday.mcap --model my_network/run/best.safetensors --overlay pictures
+
+Record other people and other poses for --val than for --train. The labels are what the network that ships is sure of,
+so the new network cannot be more accurate than that one: it can only be faster, or used to your camera. If you have
+better labels (markers, a glove), write them with BagWriter.write_hands instead, and leave out `label`.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+from hand_pose_ros.bags import BagWriter, DepthBag
+from hand_pose_ros.cli import main as hand_pose
+from hand_pose_ros.estimator import HandPoseEstimator
+
+
+def label(bag: Path, out: Path, estimator: HandPoseEstimator, min_score: float) -> int:
+    """Copy the images of a bag in which a hand was found, with its joints; returns how many."""
+    estimator.reset()
+    count = 0
+    with DepthBag(bag) as source, BagWriter(out) as labelled:
+        for frame in source:
+            hands = [hand for hand in estimator(frame.depth, frame.intrinsics) if hand.score >= min_score]
+            if hands:
+                labelled.write_depth(frame.stamp_ns, frame.frame_id, frame.depth, frame.intrinsics)
+                labelled.write_hands(frame.stamp_ns, frame.frame_id, hands)
+                count += 1
+    return count
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--train', nargs='+', type=Path, required=True, metavar='BAG')
+    parser.add_argument('--val', nargs='+', type=Path, required=True, metavar='BAG')
+    parser.add_argument('--out', type=Path, required=True, metavar='FOLDER', help='gets bags/ and run/')
+    parser.add_argument('--min-score', type=float, default=0.8, help='hands below are not learned from (0.8)')
+    parser.add_argument('--set', action='append', default=[], dest='overrides', metavar='KEY=VALUE',
+                        help='a value of the recipe, as of hand-pose train')
+    args = parser.parse_args()
+
+    estimator = HandPoseEstimator.from_pretrained()
+    for split in ('train', 'val'):
+        for number, bag in enumerate(getattr(args, split)):
+            count = label(bag, args.out / 'bags' / split / f'{number}_{bag.stem}.mcap', estimator, args.min_score)
+            print(f'{split}: {count} images of {bag}', flush=True)
+    overrides = ['dataset=bags', f'root={args.out / "bags"}', *args.overrides]
+    return hand_pose(['train', 'paper', '--out', str(args.out / 'run'), *(f'--set={item}' for item in overrides)])
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -23,6 +23,7 @@ _EXAMPLES = """examples:
   hand-pose synth show sensors.png --per-sensor --number 8
   hand-pose synth show both.png --sensors kinect2 --real frames/kinect2 363.9 363.9 255.4 206.3 0.001
   hand-pose synth write data/ --number 100000
+  hand-pose synth record hand.mcap --sensors kinect2 --number 90
   hand-pose synth stats --sensors kinect2 --real frames/kinect2 363.9 363.9 255.4 206.3 0.001
 """
 _COLUMNS = 8
@@ -44,7 +45,7 @@ def add_parser(subparsers: Any) -> None:
     real.add_argument('--real', nargs=6, action='append', default=[],
                       metavar=('FOLDER', 'FX', 'FY', 'CX', 'CY', 'SCALE'),
                       help='16-bit depth PNGs, their camera in pixels and metres per unit; may be repeated')
-    actions = parser.add_subparsers(dest='action', metavar='show|write|stats', required=True)
+    actions = parser.add_subparsers(dest='action', metavar='show|write|record|stats', required=True)
 
     show = actions.add_parser('show', parents=[common, real], help='a contact sheet')
     show.add_argument('out', type=Path, metavar='FILE', help='a PNG')
@@ -59,6 +60,10 @@ def add_parser(subparsers: Any) -> None:
     write.add_argument('--shard', type=_positive, default=4096, metavar='N', help='samples per file (4096)')
     write.add_argument('--device', default='cpu', help='cpu, cuda or cuda:N (cpu)')
 
+    record = actions.add_parser('record', parents=[common], help='a bag of one moving hand, with its true joints')
+    record.add_argument('out', type=Path, metavar='BAG', help='a .mcap or .db3 file, or the folder of a ROS 2 bag')
+    record.add_argument('--number', type=_positive, default=90, metavar='N', help='images, 30 a second (90)')
+
     stats = actions.add_parser('stats', parents=[common, real], help='numbers of synthetic beside real crops')
     stats.add_argument('--number', type=_positive, default=512, metavar='N', help='synthetic samples (512)')
     parser.set_defaults(parser=parser)
@@ -72,8 +77,8 @@ def _positive(text: str) -> int:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do one of show, write and stats."""
-    {'show': _show, 'write': _write, 'stats': _stats}[args.action](args)
+    """Do one of show, write, record and stats."""
+    {'show': _show, 'write': _write, 'record': _record, 'stats': _stats}[args.action](args)
     return 0
 
 
@@ -169,6 +174,28 @@ def _write(args: argparse.Namespace) -> None:
         with open(unfinished, 'wb') as file:
             np.savez_compressed(file, **arrays)
         os.replace(unfinished, path)
+
+
+def _record(args: argparse.Namespace) -> None:
+    """Depth with camera_info, as a camera publishes them, and the truth on a topic of its own."""
+    import numpy as np
+    from tqdm import tqdm
+
+    from hand_pose_ros.bags import BagWriter
+    from hand_pose_ros.estimator import HandEstimate
+    from hand_pose_ros.geometry import Cube
+    from hand_pose_ros.skeleton import HAND21
+
+    sequence = _hands(args, args.sensors).sequence(args.start, args.number)
+    with BagWriter(args.out) as bag:
+        for i, (depth, camera, joints, side) in enumerate(tqdm(sequence, total=args.number, unit='images')):
+            stamp, frame = (i + 1) * 1_000_000_000 // 30, 'camera_depth_optical_frame'
+            middle = joints.mean(axis=0)
+            truth = HandEstimate(joints, HAND21.joint_names, np.ones(len(HAND21), np.float32), 1.0, side,
+                                 Cube((float(middle[0]), float(middle[1]), float(middle[2])), 0.3), 'truth')
+            bag.write_depth(stamp, frame, depth, camera)
+            bag.write_hands(stamp, frame, [truth] if side != 'none' else [], topic='/truth/joints')
+    print(f'{args.out}: {args.number} images')
 
 
 def _stats(args: argparse.Namespace) -> None:

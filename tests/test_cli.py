@@ -1,0 +1,42 @@
+"""The `hand-pose` command as a whole: every verb explains itself, and the exit codes mean what they say."""
+
+import subprocess
+import sys
+
+import pytest
+
+from hand_pose_ros.cli import VERBS, main
+
+
+@pytest.mark.parametrize('verb', VERBS)
+def test_every_verb_has_help_with_examples(verb, capsys):
+    with pytest.raises(SystemExit) as exit_:
+        main([verb, '--help'])
+    assert exit_.value.code == 0
+    assert f'hand-pose {verb}' in capsys.readouterr().out.split('examples:')[1]
+
+
+def test_the_list_of_verbs_is_complete(capsys):
+    with pytest.raises(SystemExit):
+        main(['--help'])
+    text = capsys.readouterr().out
+    assert all(verb in text for verb in VERBS)
+
+
+@pytest.mark.parametrize('arguments', [[], ['no_such_verb'], ['estimate'], ['estimate', 'x', '--no-such-option']])
+def test_bad_arguments_are_exit_code_2(arguments, capsys):
+    with pytest.raises(SystemExit) as exit_:
+        main(arguments)
+    assert exit_.value.code == 2
+
+
+def test_failure_is_exit_code_1_and_one_sentence(tmp_path, capsys):
+    assert main(['estimate', str(tmp_path / 'no_such_folder')]) == 1
+    error = capsys.readouterr().err
+    assert 'no_such_folder' in error and error.count('\n') == 1
+
+
+def test_listing_the_verbs_loads_no_heavy_library():
+    code = ("import sys; from hand_pose_ros.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
+            "assert not {'torch', 'cv2', 'rclpy', 'matplotlib'} & set(sys.modules)")
+    subprocess.run([sys.executable, '-c', code], check=True, capture_output=True)

@@ -1,0 +1,139 @@
+"""The class that users call: depth in, metric joints out, with the weights that ship."""
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from hand_pose_ros.errors import CheckpointError, InputError
+from hand_pose_ros.estimator import HandPoseEstimator
+from hand_pose_ros.geometry import Intrinsics
+from hand_pose_ros.models.checkpoints import available
+from hand_pose_ros.synthetic.generator import SyntheticHands
+
+KINECT2 = Intrinsics(363.9, 363.9, 255.4, 206.3, 512, 424)
+
+
+@pytest.fixture(scope='module', params=sorted(available()))
+def estimator(request):
+    return HandPoseEstimator.from_pretrained(request.param, device='cpu')
+
+
+@pytest.fixture(scope='module')
+def sequence():
+    """A second of a moving hand that no network has seen."""
+    return [SimpleNamespace(depth=depth, intrinsics=camera, joints=joints)
+            for depth, camera, joints, _ in SyntheticHands('test').sequence(5, frames=30)]
+
+
+def mirrored(depth, camera):
+    flipped = np.ascontiguousarray(depth[:, ::-1])
+    return flipped, replace(camera, cx=camera.width - 1 - camera.cx)
+
+
+def test_what_a_hand_is_made_of(estimator, sequence):
+    estimator.reset()
+    frame = sequence[0]
+    [hand] = estimator(frame.depth, frame.intrinsics)
+    assert hand.joints.shape == (21, 3) and hand.joints.dtype == np.float32 and np.isfinite(hand.joints).all()
+    assert hand.joint_names[0] == 'wrist' and hand.joint_names[8] == 'index_tip' and len(hand.joint_names) == 21
+    assert hand.confidence.shape == (21,) and ((hand.confidence >= 0) & (hand.confidence <= 1)).all()
+    assert 0 <= hand.score <= 1 and hand.side in ('left', 'right', 'unknown')
+    assert set(estimator.timings) == {'detect', 'crop', 'predict', 'uncrop'}
+
+
+def test_joints_are_metric_and_where_the_hand_is(estimator, sequence):
+    estimator.reset()
+    errors = []
+    for frame in sequence:
+        [hand] = estimator(frame.depth, frame.intrinsics)
+        errors.append(np.linalg.norm(hand.joints - frame.joints, axis=1))
+    assert np.median(errors) < 0.025
+
+
+def test_one_hand_keeps_its_name_until_reset(estimator, sequence):
+    estimator.reset()
+    names = {estimator(frame.depth, frame.intrinsics)[0].id for frame in sequence}
+    assert len(names) == 1
+    estimator.reset()
+    assert estimator(sequence[0].depth, sequence[0].intrinsics)[0].id not in names
+
+
+def test_a_mirrored_scene_gives_mirrored_joints_of_the_other_hand(estimator, sequence):
+    estimator.reset()
+    for frame in sequence:
+        [hand] = estimator(frame.depth, frame.intrinsics)
+    estimator.reset()
+    for frame in sequence:
+        [other] = estimator(*mirrored(frame.depth, frame.intrinsics))
+    assert {hand.side, other.side} == {'left', 'right'}
+    assert np.abs(other.joints * (-1, 1, 1) - hand.joints).max() < 0.005
+
+
+def test_results_repeat_to_the_bit(estimator, sequence):
+    runs = []
+    for _ in range(2):
+        estimator.reset()
+        runs.append(np.stack([estimator(frame.depth, frame.intrinsics)[0].joints for frame in sequence]))
+    assert (runs[0] == runs[1]).all()
+
+
+@pytest.mark.parametrize('value', [0.0, 0.8, 5.0])
+def test_no_hand_is_an_empty_list(estimator, value):
+    estimator.reset()
+    assert estimator(np.full((424, 512), value, np.float32), KINECT2) == []
+
+
+def test_a_hand_that_leaves_is_lost_and_found_again(estimator, sequence):
+    estimator.reset()
+    frame = sequence[0]
+    assert estimator(frame.depth, frame.intrinsics)
+    assert estimator(np.zeros_like(frame.depth), frame.intrinsics) == []
+    assert estimator(frame.depth, frame.intrinsics)
+
+
+def test_input_of_the_wrong_kind_is_refused(estimator):
+    with pytest.raises(InputError, match='float32'):
+        estimator(np.zeros((424, 512), np.uint16), KINECT2)
+    with pytest.raises(InputError, match='512x424'):
+        estimator(np.zeros((480, 640), np.float32), KINECT2)
+
+
+def test_unknown_weights_are_named():
+    with pytest.raises(CheckpointError, match='no_such_model'):
+        HandPoseEstimator.from_pretrained('no_such_model')
+
+
+def test_every_real_frame_is_answered_with_a_hand(estimator, shared_data):
+    estimator.reset()
+    found = 0
+    files = sorted((shared_data / 'frames/kinect2').glob('*.png'))
+    for file in files:
+        depth = cv2.imread(str(file), cv2.IMREAD_UNCHANGED).astype(np.float32) / 1000
+        found += len(estimator(depth, KINECT2)) == 1
+    assert found >= 0.95 * len(files)
+
+
+def test_a_scene_without_a_hand_has_none(estimator, shared_data):
+    estimator.reset()
+    depth = cv2.imread(str(shared_data / 'frames/must_reject/no_hand_jsk_16uc1.png'), cv2.IMREAD_UNCHANGED)
+    assert estimator(depth.astype(np.float32) / 1000, Intrinsics(588, 588, 320, 240, 640, 480)) == []
+
+
+def test_real_fingertips_are_found_within_a_finger(estimator, shared_data):
+    """Annotated fingertips of two real sensors: the median lateral error is bounded (see the model cards)."""
+    errors = []
+    for frame in json.loads((shared_data / 'frames/annotations.json').read_text())['frames']:
+        depth = cv2.imread(str(shared_data / 'frames' / frame['file']), cv2.IMREAD_UNCHANGED)
+        camera = Intrinsics(*(frame[key] for key in ('fx', 'fy', 'cx', 'cy', 'width', 'height')))
+        estimator.reset()
+        for hand in estimator(depth.astype(np.float32) * np.float32(frame['depth_scale_m']), camera):
+            for name, point in frame['points'].items():
+                if point and name.endswith('_tip') and name not in frame['doubtful']:
+                    u, v = camera.project(hand.joints[hand.joint_names.index(name)])
+                    z = point[2] / 1000
+                    errors.append(np.hypot((u - point[0]) / camera.fx * z, (v - point[1]) / camera.fy * z))
+    assert np.median(errors) < 0.030

@@ -135,7 +135,8 @@ def crop(depth: NDArray[np.float32], cube: Cube, intrinsics: Intrinsics, size: i
     cv2.warpAffine(depth, affine, (size, size), dst=patch, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
                    borderMode=cv2.BORDER_CONSTANT, borderValue=0)
     nothing = patch == 0
-    np.clip(patch, z - half, z + half, out=patch)  # before the division: a reading may be any float
+    # Before the division, since a reading may be any float; not yet to the faces, which would round to not quite 1.
+    np.clip(patch, z - 2 * half, z + 2 * half, out=patch)
     patch -= z
     patch /= half
     patch[nothing] = 1

@@ -26,6 +26,7 @@ EXAMPLES = """examples:
   hand-pose evaluate recording.mcap --report out
   hand-pose evaluate recording.mcap --ground-truth /truth/joints --json result.json --out result.npz
   hand-pose evaluate day1/*.bag --depth-topic /camera/depth/image_rect --intrinsics 476 476 314 243 --out results
+  hand-pose evaluate synthetic-test-v1 --model hand_dense --json result.json
   torchrun --nproc-per-node 4 --no-python hand-pose evaluate bags/*.mcap --out results
 
 Text files have a frame a line, `u v d` for each joint: pixels and millimetres; gzipped or not, behind a file name
@@ -40,7 +41,9 @@ def add_parser(subparsers: Any) -> None:
         description='Score predictions in a text file against labels, or run the estimator over bags and score it, or '
                     'only time it if there is no ground truth.', formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.set_defaults(error=parser.error)
-    parser.add_argument('bags', nargs='*', metavar='BAG', help='a ROS 1 file, a ROS 2 folder, or an .mcap or .db3 file')
+    parser.add_argument('bags', nargs='*', metavar='BAG', help='a ROS 1 file, a ROS 2 folder, '
+                        'or an .mcap or .db3 file; or '
+                        'synthetic-test-v1, the benchmark, which is made on the spot')
     parser.add_argument('--ground-truth', metavar='G', help='text file of labels; with a bag also an .npz file with '
                         'joints (frames, joints, 3) in metres, or a topic of the bag with HandJointsArray')
     parser.add_argument('--json', metavar='FILE', help='write all numbers there')
@@ -81,6 +84,11 @@ def run(args: argparse.Namespace) -> int:
         args.error('give either bags or --predictions')
     if args.predictions:
         return _run_text(args)
+    if args.bags == ['synthetic-test-v1']:
+        from hand_pose_ros.evaluation.benchmark_evaluation import evaluate_benchmark
+        result = evaluate_benchmark(args.model, args.device, progress=_progress('batches'))
+        _deliver(args, result, [published.load_result(source) for source in args.compare], None)
+        return 0
     return _run_bag(args) if len(args.bags) == 1 else _run_bags(args)
 
 

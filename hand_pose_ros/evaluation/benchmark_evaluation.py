@@ -1,0 +1,80 @@
+"""Weights on synthetic-test-v1: the networks alone, on the crops of the benchmark, and how far they know themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hand_pose_ros.datasets import joints_in_metres
+from hand_pose_ros.evaluation.results import Result
+from hand_pose_ros.geometry import Intrinsics
+from hand_pose_ros.models.checkpoints import DEFAULT, load_checkpoint
+from hand_pose_ros.runtime import make_engine
+from hand_pose_ros.skeleton import get_skeleton
+from hand_pose_ros.synthetic import benchmark
+
+NEAR_MM = 20.0
+"""A joint is right within this distance: what a confidence is the probability of."""
+BINS = np.linspace(0, 1, 11)
+
+Progress = Callable[[Iterable[Any], int], Iterable[Any]]
+
+
+def evaluate_benchmark(model: str | None = None, device: str = 'auto', frames: int = benchmark.FRAMES,
+                       progress: Progress = lambda items, total: items) -> Result:
+    """Joints of the frames of synthetic-test-v1 that show a hand; left hands are mirrored, so the side is given.
+
+    For networks that judge themselves `info` has the calibration of the confidence of joints, how often the side is
+    found (from both mirrorings of each patch), and the share of frames with and without a hand whose score is at least
+    one half.
+
+    Args:
+        model: name of weights that ship, or path of a checkpoint; None takes the default.
+        frames: only the first so many.
+    """
+    checkpoint = load_checkpoint(model)
+    engine = make_engine(checkpoint.network, device=device, refiner=checkpoint.refiner)
+    joints, truth, judged = [], [], []
+    batch_size = 50
+    for batch in progress(benchmark.frames(frames, batch=batch_size), -(-frames // batch_size)):
+        answer = engine.run_full(batch['patch'].numpy())
+        present = batch['hand_present'].numpy()
+        cube = batch['cube_center'], batch['cube_side']
+        # Truth and estimate alike are those of the mirrored scene where the hand is a left one.
+        predicted = joints_in_metres(batch['joints'].new_tensor(answer['joints']), *cube).double().numpy()
+        expected = joints_in_metres(batch['joints'], *cube).double().numpy()
+        joints.append(predicted[present])
+        truth.append(expected[present])
+        if 'confidence' in answer:
+            mirrored = engine.run_full(np.ascontiguousarray(batch['patch'].numpy()[..., ::-1]))
+            right = np.linalg.norm(predicted - expected, axis=-1) * 1000 <= NEAR_MM
+            judged.append((answer['confidence'], right, answer['hand'], answer['side'] > mirrored['side'], present))
+    skeleton = get_skeleton(checkpoint.metadata['skeleton'])
+    info = {'model': model or DEFAULT, 'engine': engine.name}
+    if judged:
+        info |= _self_knowledge(*(np.concatenate(parts) for parts in zip(*judged, strict=True)))
+    note = 'crops and sides are those of the benchmark; cameras are mixed, the intrinsics are nominal'
+    return Result(str(model or DEFAULT), skeleton, Intrinsics(475.0, 475.0, 320.0, 240.0, 640, 480),
+                  np.concatenate(joints), np.concatenate(truth), notes=(note,), info=info)
+
+
+def _self_knowledge(confidence: NDArray[np.float32], right: NDArray[np.bool_], hand: NDArray[np.float32],
+                    side_found: NDArray[np.bool_], present: NDArray[np.bool_]) -> dict[str, Any]:
+    probability = 1 / (1 + np.exp(-confidence[present].astype(np.float64)))
+    right = right[present]
+    where = np.clip(np.digitize(probability, BINS) - 1, 0, len(BINS) - 2)
+    calibration = [{'confidence': [round(float(BINS[i]), 1), round(float(BINS[i + 1]), 1)],
+                    'joints': int((where == i).sum()), 'right': round(float(right[where == i].mean()), 3)}
+                   for i in range(len(BINS) - 1) if (where == i).any()]
+
+    def share(of: NDArray[np.bool_]) -> float | None:
+        return round(float(of.mean()), 4) if of.size else None
+
+    return {'calibration_20_mm': calibration, 'side_found': share(side_found[present]),
+            'hands_with_score_above_half': share(hand[present] > 0),
+            'no_hands_with_score_above_half': share(hand[~present] > 0)}
+
+

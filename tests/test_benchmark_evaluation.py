@@ -1,0 +1,34 @@
+"""Weights on the synthetic benchmark: every number is there and follows from the answers."""
+
+import numpy as np
+import pytest
+import torch
+
+from hand_pose_ros.evaluation.benchmark_evaluation import _self_knowledge, evaluate_benchmark
+from hand_pose_ros.models import build
+from hand_pose_ros.models.checkpoints import save_checkpoint
+from hand_pose_ros.synthetic import benchmark
+
+
+def test_a_network_is_scored_on_the_frames_with_a_hand(tmp_path):
+    torch.manual_seed(0)
+    weights = tmp_path / 'net.safetensors'
+    save_checkpoint(weights, build('hand_dense', width=4), {'skeleton': 'hand21', 'cube_side': 0.3})
+    result = evaluate_benchmark(str(weights), device='cpu', frames=60)
+    present = int(sum(batch['hand_present'].sum() for batch in benchmark.frames(60)))
+    summary = result.summary()
+    assert summary['frames'] == present < 60
+    assert np.isfinite(summary['mean_mm']) and summary['mean_mm'] > 10  # it has learned nothing
+    assert sum(row['joints'] for row in summary['calibration_20_mm']) == 21 * present
+
+
+def test_calibration_counts_what_was_right():
+    confidence = np.array([[4.0, -4.0], [4.0, 4.0], [9.0, 9.0]], np.float32)
+    right = np.array([[True, False], [True, False], [True, True]])
+    known = _self_knowledge(confidence, right, np.array([1.0, -1.0, 2.0], np.float32), np.array([True, False, True]),
+                            np.array([True, True, False]))
+    low, high = known['calibration_20_mm']
+    assert low == {'confidence': [0.0, 0.1], 'joints': 1, 'right': 0.0}
+    assert high == {'confidence': [0.9, 1.0], 'joints': 3, 'right': pytest.approx(2 / 3, abs=1e-3)}
+    assert known['side_found'] == 0.5
+    assert known['hands_with_score_above_half'] == 0.5 and known['no_hands_with_score_above_half'] == 1.0

@@ -16,15 +16,16 @@ from sensor_msgs.msg import CameraInfo, RegionOfInterest
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
+from hand_pose_ros import markers as markers_module
 from hand_pose_ros.drawing import FINGER_COLORS
 from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.estimator import HandEstimate
 from hand_pose_ros.geometry import Cube, Intrinsics
+from hand_pose_ros.markers import HandMarkers
 from hand_pose_ros.resources import resource
 from hand_pose_ros.ros.camera import Camera
-from hand_pose_ros.ros.conversions import hand_from_msg, hands_to_msg, skeleton_to_msg, stamp_ns
+from hand_pose_ros.ros.conversions import hand_from_msg, hands_to_msg, markers_to_msg, skeleton_to_msg, stamp_ns
 from hand_pose_ros.ros.diagnostics import depth_problem
-from hand_pose_ros.ros.markers import HandMarkers
 from hand_pose_ros.ros.params import Params, markdown_table, yaml_file
 from hand_pose_ros.skeleton import HAND21
 
@@ -62,7 +63,7 @@ def test_the_skeleton_message_names_every_joint_and_its_parent() -> None:
 
 def test_markers_are_joints_and_bones_in_the_colours_of_the_fingers() -> None:
     estimate = hand()
-    array_ = HandMarkers(HAND21).update(hands_to_msg(header(), [estimate], HAND21), 0.5)
+    array_ = markers_to_msg(header(), HandMarkers(HAND21).update([estimate]), 0.5)
     markers = {marker.ns: marker for marker in array_.markers}
     joints, bones, cube = (markers[f'hand_1/{part}'] for part in ('joints', 'bones', 'cube'))
     points = np.array([(p.x, p.y, p.z) for p in joints.points])
@@ -83,12 +84,17 @@ def test_markers_are_joints_and_bones_in_the_colours_of_the_fingers() -> None:
 
 def test_only_the_hand_that_is_gone_is_deleted() -> None:
     markers = HandMarkers(HAND21)
-    markers.update(hands_to_msg(header(), [hand('a'), hand('b')], HAND21), 0.0)
-    second = markers.update(hands_to_msg(header(), [hand('b')], HAND21), 0.0).markers
+    markers.update([hand('a'), hand('b')])
+    second = markers_to_msg(header(), markers.update([hand('b')]), 0.0).markers
     assert {m.ns for m in second if m.action == Marker.DELETE} == {'a/joints', 'a/bones', 'a/cube'}
     assert {m.ns for m in second if m.action == Marker.ADD} == {'b/joints', 'b/bones', 'b/cube'}
-    assert {m.ns for m in markers.clear(header()).markers} == {'b/joints', 'b/bones', 'b/cube'}
-    assert markers.clear(header()).markers == []
+    assert {m.namespace for m in markers.clear()} == {'b/joints', 'b/bones', 'b/cube'}
+    assert markers.clear() == []
+
+
+def test_the_constants_of_markers_are_those_of_ros() -> None:
+    for name in ('ADD', 'DELETE', 'LINE_LIST', 'SPHERE_LIST'):
+        assert getattr(markers_module, name) == getattr(Marker, name)
 
 
 def info(**fields) -> CameraInfo:

@@ -1,5 +1,6 @@
 """What `hand-pose estimate` promises: every usable image answered, in files that hold what the estimator said."""
 
+import sys
 from types import SimpleNamespace
 
 import cv2
@@ -11,6 +12,7 @@ from hand_pose_ros.cli import main
 from hand_pose_ros.drawing import FINGER_COLORS, close_up, contact_sheet, overlay, shade
 from hand_pose_ros.estimator import HandPoseEstimator
 from hand_pose_ros.geometry import Cube, Intrinsics
+from hand_pose_ros.markers import ADD, DELETE, LINE_LIST, SPHERE_LIST
 from hand_pose_ros.models import build
 from hand_pose_ros.models.checkpoints import save_checkpoint
 from hand_pose_ros.skeleton import HAND21
@@ -100,15 +102,31 @@ def test_a_bag_into_a_bag(tmp_path, bag, command, expected):
     assert counts['/hand/joints'] == 6 and counts['/hand/skeleton'] == 1
 
 
-def test_markers_are_in_the_bag_where_ros_is(tmp_path, bag, command):
-    pytest.importorskip('rclpy', reason='needs ROS 2')
-    command(bag, '--out', tmp_path / 'joints.mcap')
-    with Bag(tmp_path / 'joints.mcap') as result:
-        [markers] = [c for c in result.connections if c.topic == '/hand/markers']
-        assert markers.msgcount == 6
-        [joints] = [m for m in result.first(markers).markers if m.ns == 'hand_1/joints']
-    np.testing.assert_array_equal([(p.x, p.y, p.z) for p in joints.points],
-                                  read_hands(tmp_path / 'joints.mcap')[0].joints[0])
+def test_markers_are_in_the_bag_without_ros(tmp_path, depths, weights, monkeypatch):
+    for name in ('rclpy', 'visualization_msgs', 'hand_pose_ros.msg', 'hand_pose_ros.ros'):
+        monkeypatch.setitem(sys.modules, name, None)  # importing it fails
+    with BagWriter(tmp_path / 'some.mcap') as writer:
+        for stamp, depth in zip(STAMPS, [*depths[:2], np.full_like(depths[0], 3)], strict=False):
+            writer.write_depth(stamp, 'camera_optical', depth, CAMERA)
+    out = tmp_path / 'joints.mcap'
+    assert main(['estimate', str(tmp_path / 'some.mcap'), '--model', str(weights), '--min-score', '0', '--out',
+                 str(out)]) == 0
+    with Bag(out) as result:
+        [connection] = [c for c in result.connections if c.topic == '/hand/markers']
+        assert connection.msgtype == 'visualization_msgs/msg/MarkerArray'
+        first, second, third = (result.deserialize(connection, data).markers
+                                for _, _, data in result.messages([connection]))
+    parts = {'hand_1/joints': (SPHERE_LIST, 21), 'hand_1/bones': (LINE_LIST, 40), 'hand_1/cube': (LINE_LIST, 24)}
+    for markers in (first, second):
+        assert {m.ns: (m.type, len(m.points)) for m in markers} == parts
+        assert all(m.action == ADD and len(m.colors) == len(m.points) and m.pose.orientation.w == 1 and
+                   m.header.frame_id == 'camera_optical' for m in markers)
+    assert {m.ns for m in third} == set(parts) and all(m.action == DELETE for m in third)
+    [joints] = [m for m in first if m.ns == 'hand_1/joints']
+    np.testing.assert_array_equal([(p.x, p.y, p.z) for p in joints.points], read_hands(out)[0].joints[0])
+    assert joints.scale.x == joints.scale.z > 0
+    tip, color = HAND21.joint_names.index('ring_tip'), np.array(FINGER_COLORS['ring']) / 255
+    np.testing.assert_allclose((joints.colors[tip].r, joints.colors[tip].g, joints.colors[tip].b), color, atol=1e-6)
 
 
 def test_images_without_a_hand_are_answered_too(tmp_path, bag, weights):

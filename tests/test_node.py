@@ -37,6 +37,7 @@ from hand_pose_ros.depth import encode_compressed  # noqa: E402
 from hand_pose_ros.models import build  # noqa: E402
 from hand_pose_ros.models.checkpoints import save_checkpoint  # noqa: E402
 from hand_pose_ros.msg import HandJointsArray, HandSkeleton  # noqa: E402
+from hand_pose_ros.ros import conversions  # noqa: E402
 from hand_pose_ros.ros import node as node_module  # noqa: E402
 from hand_pose_ros.ros.node import EstimatorNode  # noqa: E402
 from hand_pose_ros.skeleton import HAND21  # noqa: E402
@@ -569,14 +570,14 @@ def test_a_slow_network_gets_the_newest_image_never_a_queue(rig: Rig, monkeypatc
     publish = rig.camera(RELIABLE, info=camera_info())
     rig.answer(publish, image(depth_with_hand(), 1))
     entered, go = threading.Event(), threading.Event()
-    convert = node_module.hands_to_msg
+    convert = conversions.hands_to_msg
 
     def slow(*arguments) -> HandJointsArray:
         entered.set()
         go.wait(20)
         return convert(*arguments)
 
-    monkeypatch.setattr(node_module, 'hands_to_msg', slow)
+    monkeypatch.setattr(conversions, 'hands_to_msg', slow)
     publish(image(depth_with_hand(), 2))
     assert entered.wait(10)
     for stamp in range(3, 10):

@@ -18,8 +18,10 @@ from hand_pose_ros.bags.bag import CAMERA_INFO, COMPRESSED_IMAGE, HAND, HANDS, I
 from hand_pose_ros.depth import encode_compressed, to_units
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.geometry import Cube, Intrinsics
+from hand_pose_ros.markers import Marker
 from hand_pose_ros.skeleton import HAND21, Skeleton
 
+MARKERS = 'visualization_msgs/msg/MarkerArray'
 _FOREVER = QosTime(2147483647, 4294967295)  # what rosbag2 writes for "no limit"
 
 
@@ -131,6 +133,12 @@ class BagWriter:
             parents=np.array(skeleton.parents, np.int8), model=model, model_version=model_version),
             stamp_ns, latched=True)
 
+    def write_markers(self, stamp_ns: int, frame_id: str, markers: Sequence[Marker],
+                      topic: str = '/hand/markers') -> None:
+        """Write a MarkerArray (see `hand_pose_ros.markers`); players show it until it is deleted."""
+        header = self._header(stamp_ns, frame_id)
+        self.write(topic, MARKERS, self._types[MARKERS](markers=[self._marker(header, m) for m in markers]), stamp_ns)
+
     def close(self) -> None:
         """Complete the bag and move it into place."""
         self._writer.close()
@@ -168,6 +176,20 @@ class BagWriter:
             id=hand.id, side=SIDES.index(hand.side), score=float(hand.score),
             joints=[self._point(joint) for joint in hand.joints], confidence=np.asarray(hand.confidence, np.float32),
             cube_center=self._point(hand.cube.center), cube_size=float(hand.cube.side))
+
+    def _marker(self, header: Any, marker: Marker) -> Any:
+        t, colors = self._types, 'std_msgs/msg/ColorRGBA'
+        image = t['sensor_msgs/msg/CompressedImage'](header=header, format='', data=np.empty(0, np.uint8))
+        identity = t['geometry_msgs/msg/Quaternion'](x=0.0, y=0.0, z=0.0, w=1.0)
+        return t['visualization_msgs/msg/Marker'](
+            header=header, ns=marker.namespace, id=0, type=marker.type, action=marker.action,
+            pose=t['geometry_msgs/msg/Pose'](position=self._point((0, 0, 0)), orientation=identity),
+            scale=t['geometry_msgs/msg/Vector3'](*marker.scale), color=t[colors](0.0, 0.0, 0.0, 0.0),
+            lifetime=t['builtin_interfaces/msg/Duration'](sec=0, nanosec=0), frame_locked=False,
+            points=[self._point(point) for point in marker.points], colors=[t[colors](*c) for c in marker.colors],
+            texture_resource='', texture=image, uv_coordinates=[], text='', mesh_resource='',
+            mesh_file=t['visualization_msgs/msg/MeshFile'](filename='', data=np.empty(0, np.uint8)),
+            mesh_use_embedded_materials=False)
 
     def _camera_info(self, header: Any, intrinsics: Intrinsics) -> Any:
         k = np.array([[intrinsics.fx, 0, intrinsics.cx], [0, intrinsics.fy, intrinsics.cy], [0, 0, 1]], np.float64)

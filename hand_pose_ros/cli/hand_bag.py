@@ -7,7 +7,7 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any, Protocol
 
 from hand_pose_ros.bags import BagWriter
-from hand_pose_ros.errors import HandPoseError
+from hand_pose_ros.markers import HandMarkers
 from hand_pose_ros.skeleton import Skeleton
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ class Stamped(Protocol):
 
 
 class HandBag:
-    """/hand/joints, /hand/skeleton and, where ROS is installed, /hand/markers: `with HandBag(...) as bag`.
+    """/hand/joints, /hand/markers and /hand/skeleton: `with HandBag(...) as bag`.
 
     Args:
         path: a file (.mcap, .db3), or the folder of a ROS 2 bag.
@@ -37,11 +37,7 @@ class HandBag:
     def __init__(self, path: str | PathLike[str], skeleton: Skeleton, metadata: Mapping[str, Any]) -> None:
         self._skeleton, self._metadata = skeleton, metadata
         self._begun = False
-        try:
-            from hand_pose_ros.ros.markers import HandMarkers
-            self._markers: Any = HandMarkers(skeleton)
-        except HandPoseError:  # no ROS, no markers; the joints need none
-            self._markers = None
+        self._markers = HandMarkers(skeleton)
         self._writer = BagWriter(path)
 
     def __enter__(self) -> HandBag:
@@ -58,16 +54,4 @@ class HandBag:
                                         str(about.get('name', about['architecture'])), str(about['version']))
             self._begun = True
         self._writer.write_hands(image.stamp_ns, image.frame_id, hands, self._skeleton)
-        if self._markers is not None:
-            self._writer.write_serialized('/hand/markers', 'visualization_msgs/msg/MarkerArray',
-                                          self._serialized_markers(image, hands), image.stamp_ns)
-
-    def _serialized_markers(self, image: Stamped, hands: Sequence[HandEstimate]) -> bytes:
-        from builtin_interfaces.msg import Time
-        from rclpy.serialization import serialize_message
-        from std_msgs.msg import Header
-
-        from hand_pose_ros.ros.conversions import hands_to_msg
-        sec, nanosec = divmod(image.stamp_ns, 1_000_000_000)
-        header = Header(stamp=Time(sec=sec, nanosec=nanosec), frame_id=image.frame_id)
-        return serialize_message(self._markers.update(hands_to_msg(header, hands, self._skeleton), lifetime_s=0.0))
+        self._writer.write_markers(image.stamp_ns, image.frame_id, self._markers.update(hands))

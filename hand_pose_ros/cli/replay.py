@@ -50,31 +50,19 @@ def run(args: argparse.Namespace) -> int:
         args.parser.error(f'--rate {args.rate}: must be more than 0')
     if args.start < 0:
         args.parser.error(f'--start {args.start}: must not be negative')
-    from hand_pose_ros.bags import Bag
-    from hand_pose_ros.ros.qos import let_large_images_through
-    from hand_pose_ros.ros.replay import Replay  # says what is missing where there is no ROS
-    import rclpy  # isort: skip
-    from rclpy.signals import SignalHandlerOptions  # isort: skip
+    from hand_pose_ros.ros.replay import replaying  # says what is missing where there is no ROS
 
-    let_large_images_through()
-    # Without handlers of rclpy, Ctrl-C arrives here, between two messages, as a KeyboardInterrupt.
-    rclpy.init(args=['--ros-args', *args.ros_args], signal_handler_options=SignalHandlerOptions.NO)
-    try:
-        with Bag(args.bag) as bag:
-            replay = Replay(bag, topics=args.topics, rate=args.rate, reliability=args.qos, clock=args.clock,
-                            paused=args.start_paused)
-            try:
-                replay.wait_for_subscribers(args.wait)
+    with replaying(args.bag, args.ros_args, topics=args.topics, rate=args.rate, reliability=args.qos, clock=args.clock,
+                   paused=args.start_paused) as replay:
+        try:
+            replay.wait_for_subscribers(args.wait)
+            replay.play(args.start)
+            while args.loop:
                 replay.play(args.start)
-                while args.loop:
-                    replay.play(args.start)
-            except KeyboardInterrupt:
-                pass  # how a loop ends
-            finally:
-                for topic, count in sorted(replay.published.items()):
-                    print(f'{count:7d}  {topic}')
-                print(f'the latest message was {1000 * replay.lateness_s:.0f} ms late')
-                replay.close()
-    finally:
-        rclpy.try_shutdown()
+        except KeyboardInterrupt:
+            pass  # how a loop ends
+        finally:
+            for topic, count in sorted(replay.published.items()):
+                print(f'{count:7d}  {topic}')
+            print(f'the latest message was {1000 * replay.lateness_s:.0f} ms late')
     return 0

@@ -12,8 +12,10 @@ import traceback
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from numpy.typing import NDArray
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
@@ -21,21 +23,21 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.subscription import Subscription
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, RegionOfInterest
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
-from visualization_msgs.msg import MarkerArray
 
 from hand_pose_ros.depth import decode_compressed, decode_image
+from hand_pose_ros.detection import Region
 from hand_pose_ros.errors import HandPoseError
-from hand_pose_ros.estimator import HandPoseEstimator
-from hand_pose_ros.msg import HandJointsArray, HandSkeleton
+from hand_pose_ros.estimator import HandEstimate, HandPoseEstimator
+from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.ros import params as parameters
 from hand_pose_ros.ros import qos, topics
 from hand_pose_ros.ros.camera import Camera
-from hand_pose_ros.ros.conversions import hands_to_msg, skeleton_to_msg, stamp_ns
+from hand_pose_ros.ros.conversions import stamp_ns
 from hand_pose_ros.ros.diagnostics import Statistics, depth_problem
-from hand_pose_ros.ros.markers import HandMarkers
+from hand_pose_ros.ros.outputs import Outputs
 from hand_pose_ros.ros.worker import NewestWorker
 
 _Transition = Callable[['EstimatorNode', LifecycleState], TransitionCallbackReturn]
@@ -85,11 +87,9 @@ class EstimatorNode(LifecycleNode):
     @_logged
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load the network and create the publishers."""
-        self._estimator = self._params.make_estimator()
-        self._markers = HandMarkers(self._estimator.skeleton)
-        self._joints_pub = self.create_lifecycle_publisher(HandJointsArray, 'hand/joints', qos.RESULTS)
-        self._markers_pub = self.create_lifecycle_publisher(MarkerArray, 'hand/markers', qos.RESULTS)
-        self._skeleton_pub = self.create_lifecycle_publisher(HandSkeleton, 'hand/skeleton', qos.LATCHED)
+        estimator = self._params.make_estimator()
+        self._outputs = Outputs(self, estimator, self._params, self._complain)
+        self._estimator = estimator
         return super().on_configure(state)
 
     @_logged
@@ -97,10 +97,7 @@ class EstimatorNode(LifecycleNode):
         """Start to listen, and tell what the joints will mean."""
         super().on_activate(state)
         self._start()
-        assert self._estimator is not None
-        about, now = self._estimator.metadata, Header(stamp=self.get_clock().now().to_msg())
-        self._skeleton_pub.publish(skeleton_to_msg(
-            now, self._estimator.skeleton, str(about.get('name', about['architecture'])), str(about['version'])))
+        self._outputs.publish_skeleton()
         return TransitionCallbackReturn.SUCCESS
 
     @_logged
@@ -135,8 +132,7 @@ class EstimatorNode(LifecycleNode):
         if self._estimator is None:
             return
         self._estimator = None
-        for publisher in (self._joints_pub, self._markers_pub, self._skeleton_pub):
-            self.destroy_lifecycle_publisher(publisher)
+        self._outputs.close()
         gc.collect()
         if (torch := sys.modules.get('torch')) is not None and torch.cuda.is_available():
             torch.cuda.empty_cache()
@@ -144,16 +140,19 @@ class EstimatorNode(LifecycleNode):
     def _start(self) -> None:
         image_topic, info_topic = topics.input_topics(self, self._params.transport)
         raw = self._params.transport == 'raw'
-        image_type, self._decode = (Image, decode_image) if raw else (CompressedImage, decode_compressed)
+        self._image_type, self._decode = (Image, decode_image) if raw else (CompressedImage, decode_compressed)
         self._camera = Camera(info_topic)
         self._last_header = Header()
         self._heard_at, self._silent = time.monotonic(), False
-        for kind, topic, callback in ((CameraInfo, info_topic, self._on_camera_info),
-                                      (image_type, image_topic, self._on_image)):
+        self._regions: list[Region] = []
+        inputs = [(CameraInfo, info_topic, self._on_camera_info), (self._image_type, image_topic, self._on_image)]
+        if self._params.detector == 'region':
+            inputs.append((RegionOfInterest, self.resolve_topic_name(topics.REGION), self._on_region))
+        for kind, topic, callback in inputs:
             self._inputs.append(topics.subscribe(self, kind, topic, callback, self._complain))
         self._image_topic = self._inputs[1].topic_name
         self._worker = NewestWorker(self._answer)
-        self.get_logger().info(f'listening to {self._image_topic} and {self._inputs[0].topic_name}')
+        self.get_logger().info(f'listening to {", ".join(sorted(listener.topic_name for listener in self._inputs))}')
 
     def _stop(self) -> None:
         while self._inputs:
@@ -164,7 +163,7 @@ class EstimatorNode(LifecycleNode):
         self._worker.stop()
         self._worker = None
         if self.context.ok():
-            self._markers_pub.publish(self._markers.clear(self._last_header))
+            self._outputs.clear(self._last_header)
 
     # Callbacks
 
@@ -175,6 +174,9 @@ class EstimatorNode(LifecycleNode):
     def _on_camera_info(self, info: CameraInfo) -> None:
         self._statistics.count(camera_infos=1)
         self._camera.update(info)
+
+    def _on_region(self, region: RegionOfInterest) -> None:
+        self._regions = [(region.x_offset, region.y_offset, region.width, region.height)]
 
     def _on_parameters(self, changes: Sequence[Parameter]) -> SetParametersResult:
         try:
@@ -203,8 +205,7 @@ class EstimatorNode(LifecycleNode):
         quiet = time.monotonic() - self._heard_at if self._worker is not None else 0
         if quiet > SILENCE_S and not self._silent:
             self._silent = True
-            kind = 'Image' if self._params.transport == 'raw' else 'CompressedImage'
-            self._complain(topics.explain_silence(self, self._image_topic, f'sensor_msgs/msg/{kind}', quiet))
+            self._complain(topics.explain_silence(self, self._image_topic, self._image_type, quiet))
         status = self._statistics.report(self.get_name(), self._state, self._facts())
         if status.level == DiagnosticStatus.WARN:
             self._say(status.message)
@@ -240,13 +241,15 @@ class EstimatorNode(LifecycleNode):
         """One image in, one answer out. Whatever goes wrong is said, and the next image gets its chance."""
         try:
             start = time.perf_counter()
-            hands = self._estimate(image)
-            self._joints_pub.publish(hands)
+            depth = self._decode(image, self._params.depth_scale, source=self._image_topic)
+            self._statistics.time(decode=time.perf_counter() - start)
+            intrinsics = self._camera.intrinsics(depth.shape[1], depth.shape[0], self._params)
+            hands = self._estimate(image.header, depth, intrinsics)
+            self._outputs.publish_joints(image.header, hands)
             self._statistics.time(total=time.perf_counter() - start)
             self._statistics.age(self.get_clock().now().nanoseconds - stamp_ns(image.header))
-            self._statistics.count(answered=1, hands=len(hands.hands))
-            if self._params.publish_markers and self._markers_pub.get_subscription_count():
-                self._markers_pub.publish(self._markers.update(hands, self._params.marker_lifetime))
+            self._statistics.count(answered=1, hands=len(hands))
+            self._outputs.publish_others(image.header, hands, depth, intrinsics, self._params)
         except HandPoseError as error:
             self._statistics.count(refused=1)
             self._complain(str(error))
@@ -255,25 +258,23 @@ class EstimatorNode(LifecycleNode):
                 self._statistics.count(refused=1)
                 self._complain(f'unexpected error on an image, please report it:\n{traceback.format_exc()}')
 
-    def _estimate(self, image: Image | CompressedImage) -> HandJointsArray:
-        params, estimator, topic = self._params, self._estimator, self._image_topic
+    def _estimate(self, header: Header, depth: NDArray[np.float32], intrinsics: Intrinsics) -> list[HandEstimate]:
+        params, estimator = self._params, self._estimator
+        regions = self._regions if params.detector == 'region' else None
         assert estimator is not None
-        start = time.perf_counter()
-        depth = self._decode(image, params.depth_scale, source=topic)
-        self._statistics.time(decode=time.perf_counter() - start)
-        intrinsics = self._camera.intrinsics(depth.shape[1], depth.shape[0], params)
         params.apply(estimator)
-        if self._reset or stamp_ns(image.header) < stamp_ns(self._last_header):  # a bag began again
+        if self._reset or stamp_ns(header) < stamp_ns(self._last_header):  # a bag began again
             self._reset = False
             estimator.reset()
-        self._last_header = image.header
-        if problem := self._camera.frame_problem(image.header.frame_id, params):
-            self._complain(f'{topic}: {problem}')
-        hands = estimator(depth, intrinsics, time_s=stamp_ns(image.header) / 1e9)
+        self._last_header = header
+        if problem := self._camera.frame_problem(header.frame_id, params):
+            self._complain(f'{self._image_topic}: {problem}')
+        hands = estimator(depth, intrinsics, time_s=stamp_ns(header) / 1e9, regions=regions)
         self._statistics.time(**estimator.timings)
-        if not hands and (problem := depth_problem(depth, params.min_depth, params.max_depth)):
-            self._complain(f'{topic}: {problem}')
-        return hands_to_msg(image.header, hands, estimator.skeleton)
+        problem = topics.NO_REGION if regions == [] else depth_problem(depth, params.min_depth, params.max_depth)
+        if not hands and problem:
+            self._complain(f'{self._image_topic}: {problem}')
+        return hands
 
 
 def main(args: list[str] | None = None) -> int:

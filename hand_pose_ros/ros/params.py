@@ -58,12 +58,26 @@ class Params:
     side: str = _parameter('auto', 'Which hands there are; auto finds out.', choices=('auto', 'left', 'right'))
     max_hands: int = _parameter(1, 'At most this many hands per image.', low=1, high=8)
     min_score: float = _parameter(0.3, 'Hands with a lower score are not reported.', low=0.0, high=1.0)
+    detector: str = _parameter('nearest', 'Where new hands are looked for: at what is nearest to the camera, or within '
+                               'the newest region of hand/region (sensor_msgs/RegionOfInterest, in pixels of the '
+                               'depth image; one without width or height says that there is no hand).',
+                               choices=('nearest', 'region'), fixed=_CONFIGURED)
     tracking: bool = _parameter(True, 'Look first where the hands of the last image were.')
     smoothing: float = _parameter(0.0, 'Cutoff in Hz of the filter on the joints of a hand at rest; 0 = none.',
                                   low=0.0, high=30.0)
+    target_frame: str = _parameter('', 'Frame of hand/joints and hand/poses; empty = that of the depth image. Needs '
+                                   'tf2_ros. Markers and tf stay in the frame of the camera.', fixed=_CONFIGURED)
     publish_markers: bool = _parameter(True, 'Publish hand/markers (only built while somebody listens).')
     marker_lifetime: float = _parameter(0.5, 'Seconds after which a viewer removes the markers of a node that died; '
                                         '0 = never. Lost hands are deleted at once.', low=0.0, high=60.0)
+    publish_poses: bool = _parameter(False, 'Publish hand/poses (geometry_msgs/PoseArray), the joints of all hands in '
+                                     'the order of the skeleton; not turned.', fixed=_CONFIGURED)
+    publish_joint_states: bool = _parameter(False, 'Publish hand/joint_states (sensor_msgs/JointState) while there '
+                                            'are hands: angles of the fingers in radians, e.g. of '
+                                            'r_index_mcp_flexion. Needs a model with the joints of hand21.',
+                                            fixed=_CONFIGURED)
+    publish_tf: bool = _parameter(False, 'Publish a frame for each joint to /tf, e.g. r_index_tip. Needs tf2_msgs.',
+                                  fixed=_CONFIGURED)
     publish_diagnostics: bool = _parameter(True, 'Publish /diagnostics once a second.')
     autostart: bool = _parameter(True, 'Configure and activate at start; false waits for lifecycle transitions.',
                                  fixed=_ALWAYS)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
+from os import PathLike
 from typing import Any
 
 import rclpy
@@ -13,6 +15,7 @@ from rclpy.exceptions import InvalidTopicNameException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
 from rosbags.convert.converter import migrate_bytes
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, QosDurability, QosReliability
 from rosgraph_msgs.msg import Clock
@@ -21,6 +24,7 @@ from std_srvs.srv import SetBool
 from hand_pose_ros.bags import Bag
 from hand_pose_ros.bags.bag import typestore
 from hand_pose_ros.errors import InputError
+from hand_pose_ros.ros import qos
 
 CLOCK_PERIOD_S = 0.025
 SETTLE_S = 0.5
@@ -177,14 +181,39 @@ class Replay:
         return response
 
 
+@contextmanager
+def replaying(path: str | PathLike[str], ros_args: Sequence[str] = (), **options: Any) -> Iterator[Replay]:
+    """Open a bag to replay it in a ROS context of its own, in which Ctrl-C is a KeyboardInterrupt.
+
+    Args:
+        ros_args: remappings (`-r from:=to`) and so on.
+        options: of Replay.
+
+    Raises:
+        InputError: the bag cannot be read, or one of the topics cannot be published.
+    """
+    qos.let_large_images_through()
+    # Without handlers of rclpy, Ctrl-C arrives between two messages.
+    rclpy.init(args=['--ros-args', *ros_args], signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        with Bag(path) as bag:
+            replay = Replay(bag, **options)
+            try:
+                yield replay
+            finally:
+                replay.close()
+    finally:
+        rclpy.try_shutdown()
+
+
 def _quality(connection: Connection, reliability: str) -> QoSProfile:
     """What the publisher of a topic offers: as recorded, unless a reliability is asked for."""
     ext: Any = connection.ext
     profile = QoSProfile(depth=10, reliability=QoSReliabilityPolicy.RELIABLE)
     if isinstance(ext, ConnectionExtRosbag2):
         recorded = ext.offered_qos_profiles
-        latched = any(qos.durability == QosDurability.TRANSIENT_LOCAL for qos in recorded)
-        if any(qos.reliability == QosReliability.BEST_EFFORT for qos in recorded):
+        latched = any(offer.durability == QosDurability.TRANSIENT_LOCAL for offer in recorded)
+        if any(offer.reliability == QosReliability.BEST_EFFORT for offer in recorded):
             profile.reliability = QoSReliabilityPolicy.BEST_EFFORT
     else:
         latched = bool(ext.latching)

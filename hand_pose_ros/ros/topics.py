@@ -16,7 +16,10 @@ try:
 except ImportError:  # ROS 2 Humble
     from rclpy.qos_event import SubscriptionEventCallbacks
 
-IMAGE, CAMERA_INFO = 'depth/image_rect', 'depth/camera_info'
+IMAGE, CAMERA_INFO, REGION = 'depth/image_rect', 'depth/camera_info', 'hand/region'
+
+NO_REGION = (f'no region arrived on {REGION}, so no hand is looked for: publish where it is in the depth image, or set '
+             'the parameter detector to nearest')
 
 
 def input_topics(node: Node, transport: str) -> tuple[str, str]:
@@ -60,13 +63,14 @@ def describe_publishers(node: Node, topic: str) -> str:
     return 'published by ' + ', '.join(sorted(publishers)) if publishers else 'without any publisher'
 
 
-def explain_silence(node: Node, topic: str, topic_type: str, seconds: float) -> str:
+def explain_silence(node: Node, topic: str, message_type: type, seconds: float) -> str:
     """Why no image may have arrived for some seconds, and what to do.
 
     Args:
         topic: resolved name.
-        topic_type: what is expected there, e.g. `sensor_msgs/msg/Image`.
+        message_type: what is expected there.
     """
+    topic_type = f'sensor_msgs/msg/{message_type.__name__}'
     said = f'no image arrived on {topic} for {seconds:.0f} s; the topic is {describe_publishers(node, topic)}'
     infos = node.get_publishers_info_by_topic(topic)
     if not infos:

@@ -196,7 +196,7 @@ class HandPoseEstimator:
         return hands
 
     def _read(self, depth: NDArray[np.float32], intrinsics: Intrinsics, cube: Cube, track: _Track) -> _Reading:
-        """Look into a cube, and again where the joints are: from an arm that was found first, that leads to its hand."""
+        """Look into a cube, and again where its joints are: from an arm that was found first, to the hand."""
         reading = self._predict(depth, intrinsics, cube, track)
         for _ in range(LOOKS - 1):
             center = reading.joints.mean(axis=0)

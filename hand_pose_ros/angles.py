@@ -46,20 +46,20 @@ def finger_angles(joints: ArrayLike, side: str) -> NDArray[np.float64]:
     Raises:
         InputError: another side, or another number of joints.
     """
-    joints = np.asarray(joints, np.float64)
+    points = np.asarray(joints, np.float64)
     if side not in ('left', 'right'):
         raise InputError(f"angles of the fingers of a hand whose side is '{side}': give left or right")
-    if joints.shape[-2:] != (len(HAND21), 3):
-        raise InputError(f'angles of the fingers need the joints of hand21 as (..., 21, 3), not {joints.shape}')
+    if points.shape[-2:] != (len(HAND21), 3):
+        raise InputError(f'angles of the fingers need the joints of hand21 as (..., 21, 3), not {points.shape}')
     if side == 'left':
-        joints = joints * np.array([-1, 1, 1])  # any mirror makes it a right hand
-    wrist, index, middle, ring = (joints[..., _JOINT[name], :] for name in ('wrist', 'index_mcp', 'middle_mcp',
+        points = points * np.array([-1, 1, 1])  # any mirror makes it a right hand
+    wrist, index, middle, ring = (points[..., _JOINT[name], :] for name in ('wrist', 'index_mcp', 'middle_mcp',
                                                                             'ring_mcp'))
     y = _unit(middle - wrist)
     z = _unit(np.cross(index - ring, y))
     palm = np.stack([np.cross(y, z), y, z], -2)
     # Directions of the three bones of each digit in the frame of the palm, (..., 5 digits, 3 bones, 3).
-    digits = ((joints - wrist[..., None, :]) @ palm.swapaxes(-1, -2))[..., 1:, :]
+    digits = ((points - wrist[..., None, :]) @ palm.swapaxes(-1, -2))[..., 1:, :]
     digits = digits.reshape(*digits.shape[:-2], 5, 4, 3)
     bones = _unit(np.diff(digits, axis=-2))
 

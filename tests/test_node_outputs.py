@@ -1,0 +1,259 @@
+"""What the node publishes besides joints and markers when asked to, and hands that are looked for where it is told."""
+
+# ruff: noqa: F811 (a fixture from another file is imported, and then an argument)
+
+import sys
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='needs ROS 2')
+pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
+
+from geometry_msgs.msg import PoseArray, TransformStamped
+from sensor_msgs.msg import Image, JointState, RegionOfInterest
+from std_msgs.msg import Header
+from test_node import (  # noqa: F401 (fixtures)
+    FOCAL,
+    HEIGHT,
+    RELIABLE,
+    WIDTH,
+    Rig,
+    _load_once,
+    camera_info,
+    depth_with_hand,
+    image,
+    rig,
+    stamp_of,
+    weights,
+)
+
+from hand_pose_ros.angles import ANGLES, finger_angles
+from hand_pose_ros.depth import decode_image
+from hand_pose_ros.estimator import HandEstimate
+from hand_pose_ros.geometry import Cube, Intrinsics, crop
+from hand_pose_ros.models import build
+from hand_pose_ros.models.checkpoints import save_checkpoint
+from hand_pose_ros.msg import HandJointsArray
+from hand_pose_ros.ros.conversions import (
+    hands_to_msg,
+    in_frame,
+    joint_states_to_msg,
+    prefixes,
+    transforms_to_msgs,
+)
+from hand_pose_ros.skeleton import HAND21
+
+pytestmark = pytest.mark.usefixtures('ros_domain')
+
+
+def xyz(points) -> np.ndarray:
+    return np.array([(p.x, p.y, p.z) for p in points])
+
+
+def two_hands(left: float, right: float) -> np.ndarray:
+    """(H, W) metres: two hand-sized discs at these distances, 0.3 m apart."""
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    depth = np.full((HEIGHT, WIDTH), 3.0, np.float32)
+    for z, x in ((left, -0.17), (right, 0.17)):
+        depth[np.hypot(u - WIDTH / 2 - x * FOCAL / z, v - HEIGHT / 2) < 0.05 * FOCAL / z] = z
+    return depth
+
+
+def estimate(side: str = 'right', name: str = 'hand_1', seed: int = 0) -> HandEstimate:
+    joints = np.random.default_rng(seed).normal((0, 0, 0.5), 0.05, (21, 3)).astype(np.float32)
+    return HandEstimate(joints, HAND21.joint_names, np.ones(21, np.float32), 0.9, side, Cube((0, 0, 0.5), 0.3), name)
+
+
+# ------------------------------------------------------------------------------------------------------------ messages
+
+def test_names_tell_the_side_and_are_never_the_same() -> None:
+    hands = [estimate('right', 'a'), estimate('left', 'b'), estimate('right', 'c'), estimate('unknown', 'd')]
+    assert prefixes(hands) == ['r_', 'l_', 'c_', 'd_']
+    states = joint_states_to_msg(Header(), hands)
+    assert len(states.name) == len(set(states.name)) == len(states.position) == 3 * len(ANGLES)
+    assert states.position[states.name.index('l_index_mcp_flexion')] == pytest.approx(
+        finger_angles(hands[1].joints, 'left')[ANGLES.index('index_mcp_flexion')])
+    assert not any(name.startswith('d_') for name in states.name)
+
+
+def test_a_frame_for_each_joint() -> None:
+    hand = estimate('left')
+    messages = {m.child_frame_id: m for m in transforms_to_msgs(Header(frame_id='camera'), [hand])}
+    assert list(messages) == [f'l_{name}' for name in HAND21.joint_names]
+    tip = messages['l_index_tip']
+    assert tip.header.frame_id == 'camera' and tip.transform.rotation.w == 1
+    np.testing.assert_allclose(xyz([tip.transform.translation])[0], hand.joints[8])
+
+
+def turned() -> TransformStamped:
+    """From the camera into a frame in which its z is x, its x is -y and its y is -z (REP-103), 2 m up."""
+    transform = TransformStamped(header=Header(frame_id='base_link'))
+    transform.transform.translation.z = 2.0
+    q = transform.transform.rotation
+    q.x, q.y, q.z, q.w = -0.5, 0.5, -0.5, 0.5
+    return transform
+
+
+def test_hands_in_another_frame() -> None:
+    before = hands_to_msg(Header(frame_id='camera'), [estimate()], HAND21)
+    before.header.stamp.sec = 5
+    after = in_frame(before, turned())
+    x, y, z = xyz(before.hands[0].joints).T
+    np.testing.assert_allclose(xyz(after.hands[0].joints), np.stack([z, -x, 2 - y], 1), atol=1e-12)
+    np.testing.assert_allclose(xyz([after.hands[0].cube_center]), [(0.5, 0, 2)], atol=1e-12)
+    assert (after.header.frame_id, after.header.stamp.sec, before.header.frame_id) == ('base_link', 5, 'camera')
+    assert after.hands[0].confidence == before.hands[0].confidence and after.skeleton == 'hand21'
+
+
+# ------------------------------------------------------------------------------------------------------------ the node
+
+def test_nothing_else_is_offered_unless_asked_for(rig: Rig) -> None:
+    rig.start()
+    topics = {topic for topic, _ in rig.node.get_publisher_names_and_types_by_node('estimator', '/')}
+    assert not topics & {'/hand/poses', '/hand/joint_states', '/tf'} and '/hand/joints' in topics
+
+
+def test_poses_angles_and_the_crop(rig: Rig) -> None:
+    rig.start(publish_poses=True, publish_joint_states=True, side='right')
+    for kind, topic in ((PoseArray, 'hand/poses'), (JointState, 'hand/joint_states')):
+        rig.listen(kind, topic, RELIABLE)
+    publish = rig.camera(info=camera_info())
+    hand = rig.answer(publish, image(depth_with_hand(), 5)).hands[0]
+    rig.until(lambda: rig.received[PoseArray] and rig.received[JointState], 'poses and angles')
+    poses, states = rig.received[PoseArray][0], rig.received[JointState][0]
+    assert stamp_of(poses) == stamp_of(states) == 5 and poses.header.frame_id == 'camera_optical'
+    np.testing.assert_array_equal(xyz(pose.position for pose in poses.poses), xyz(hand.joints))
+    assert {pose.orientation.w for pose in poses.poses} == {1.0}
+    assert list(states.name) == [f'r_{angle}' for angle in ANGLES]
+    np.testing.assert_allclose(states.position, finger_angles(xyz(hand.joints), 'right'), atol=1e-6)
+
+    crops = rig.node._outputs._crop_pub
+    assert crops.get_subscription_count() == 0
+    rig.listen(Image, 'estimator/debug/crop', RELIABLE)
+    rig.until(lambda: crops.get_subscription_count() == 1, 'a subscriber')
+    hand = rig.answer(publish, image(depth_with_hand(), 6)).hands[0]
+    rig.until(lambda: rig.received[Image], 'the crop')
+    patch = rig.received[Image][0]
+    assert (patch.width, patch.height, patch.encoding, stamp_of(patch)) == (128, 128, '32FC1', 6)
+    cube = Cube(tuple(xyz([hand.cube_center])[0].tolist()), hand.cube_size)
+    intrinsics = Intrinsics(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT)
+    seen = crop(decode_image(image(depth_with_hand())), cube, intrinsics)
+    np.testing.assert_allclose(np.frombuffer(patch.data, np.float32).reshape(seen.shape), seen, atol=1e-5)
+
+    empty = rig.answer(publish, image(np.full((HEIGHT, WIDTH), 3.0), 7))
+    rig.until(lambda: stamp_of(rig.received[PoseArray][-1]) == 7, 'no poses')
+    assert empty.hands == [] and rig.received[PoseArray][-1].poses == []
+    assert stamp_of(rig.received[JointState][-1]) == stamp_of(rig.received[Image][-1]) == 6
+
+
+def test_angles_need_the_joints_of_hand21(rig: Rig, tmp_path) -> None:
+    path = tmp_path / 'nyu.safetensors'
+    save_checkpoint(path, build('deep_prior', joints=14), {'skeleton': 'nyu14', 'cube_side': 0.3})
+    rig.start(publish_joint_states=True, model=str(path))
+    rig.until_said('publish_joint_states', 'hand21', 'nyu14')
+    assert rig.state() == 'unconfigured' and rig.set_parameter('publish_joint_states', False)[0]
+    assert rig.transition('configure') and rig.transition('activate')
+    assert len(rig.answer(rig.camera(info=camera_info()), image(depth_with_hand())).hands[0].joints) == 14
+
+
+@pytest.mark.parametrize('parameter, value, package', [
+    ('target_frame', 'base_link', 'tf2_ros'), ('publish_tf', True, 'tf2_msgs')])
+def test_where_there_is_no_tf_it_is_said_and_the_rest_works(
+        rig: Rig, monkeypatch: pytest.MonkeyPatch, parameter: str, value: object, package: str) -> None:
+    monkeypatch.setitem(sys.modules, package, None)  # also where it is installed
+    rig.start(**{parameter: value})
+    rig.until_said(parameter, package, 'not installed')
+    assert rig.state() == 'unconfigured'
+    assert rig.set_parameter(parameter, type(value)())[0]
+    assert rig.transition('configure') and rig.transition('activate')
+    assert rig.answer(rig.camera(info=camera_info()), image(depth_with_hand())).hands
+
+
+def test_frames_of_the_joints_on_tf(rig: Rig) -> None:
+    tf2_msgs = pytest.importorskip('tf2_msgs.msg', reason='ROS from wheels has no tf2_msgs')
+    rig.start(publish_tf=True, side='left')
+    rig.listen(tf2_msgs.TFMessage, '/tf', RELIABLE)
+    publish = rig.camera(info=camera_info())
+    hand = rig.answer(publish, image(depth_with_hand(), 5)).hands[0]
+    rig.until(lambda: rig.received[tf2_msgs.TFMessage], 'frames')
+    transforms = rig.received[tf2_msgs.TFMessage][0].transforms
+    assert [t.child_frame_id for t in transforms] == [f'l_{name}' for name in HAND21.joint_names]
+    assert {(stamp_of(t), t.header.frame_id) for t in transforms} == {(5, 'camera_optical')}
+    np.testing.assert_array_equal(xyz(t.transform.translation for t in transforms), xyz(hand.joints))
+    rig.answer(publish, image(depth_with_hand(), 6, frame=''))
+    rig.until_said('frame_id', 'empty', 'tf')
+
+
+def test_joints_in_the_target_frame(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a stand-in for tf2_ros, which has no wheels: what it is asked, and what is made of its answer."""
+    asked: list[tuple] = []
+    stand_in = ModuleType('tf2_ros')
+    stand_in.TransformException = type('TransformException', (Exception,), {})
+
+    class Buffer:
+        def lookup_transform(self, target, source, when, timeout):
+            asked.append((target, source, when.nanoseconds))
+            if source == 'lost':
+                raise stand_in.TransformException('two unconnected trees')
+            return turned()
+
+    stand_in.Buffer = Buffer
+    stand_in.TransformListener = lambda buffer, node: SimpleNamespace(unregister=lambda: asked.append(('closed',)))
+    monkeypatch.setitem(sys.modules, 'tf2_ros', stand_in)
+    rig.start(target_frame='base_link', tracking=False, publish_poses=True)
+    rig.listen(PoseArray, 'hand/poses', RELIABLE)
+    publish = rig.camera(RELIABLE, info=camera_info())
+    there = rig.answer(publish, image(depth_with_hand(), 7))
+    assert asked == [('base_link', 'camera_optical', 7_000_000)] and there.header.frame_id == 'base_link'
+    center = xyz([there.hands[0].cube_center])[0]
+    assert center == pytest.approx((0.6, 0, 2), abs=0.15)
+    rig.until(lambda: rig.received[PoseArray], 'poses')
+    assert rig.received[PoseArray][0].header.frame_id == 'base_link'
+    publish(image(depth_with_hand(), 8, frame='lost'))
+    rig.until_said('lost', 'base_link', 'two unconnected trees')
+    assert stamp_of(rig.answer(publish, image(depth_with_hand(), 9))) == 9
+    assert [stamp_of(answer) for answer in rig.received[HandJointsArray]] == [7, 9]
+    assert rig.transition('deactivate') and rig.transition('cleanup') and asked[-1] == ('closed',)
+
+
+def test_hands_are_looked_for_in_the_region_that_is_given(rig: Rig) -> None:
+    rig.start(detector='region', tracking=False)
+    publish = rig.camera(info=camera_info())
+    scene = image(two_hands(left=0.55, right=0.65))
+    assert rig.answer(publish, scene).hands == []
+    rig.until_said('hand/region', 'no region arrived', 'detector')
+    regions = rig.client.create_publisher(RegionOfInterest, 'hand/region', RELIABLE)
+    rig.connected(regions)
+
+    def found(region: RegionOfInterest) -> list[float]:
+        regions.publish(region)
+        wanted = [(region.x_offset, region.y_offset, region.width, region.height)]
+        rig.until(lambda: rig.node._regions == wanted, 'the region')
+        return [hand.cube_center.x for hand in rig.answer(publish, scene).hands]
+
+    half = WIDTH // 2
+    [x] = found(RegionOfInterest(x_offset=half, width=half, height=HEIGHT))
+    assert x > 0.1
+    [x] = found(RegionOfInterest(width=half, height=HEIGHT))
+    assert x < -0.1
+    assert found(RegionOfInterest()) == []
+    assert found(RegionOfInterest(x_offset=2**32 - 1, y_offset=2**32 - 1, width=2**32 - 1, height=2**32 - 1)) == []
+    assert len(found(RegionOfInterest(width=2**32 - 1, height=2**32 - 1))) == 1
+    assert not rig.set_parameter('detector', 'nearest')[0]
+
+
+def test_two_hands_keep_their_ids_whichever_is_nearer(rig: Rig) -> None:
+    rig.start(max_hands=2)
+    publish = rig.camera(info=camera_info())
+    names = []
+    for i, (left, right) in enumerate([(0.60, 0.64), (0.61, 0.62), (0.62, 0.60), (0.64, 0.59)]):
+        hands = rig.answer(publish, image(two_hands(left, right), 1000 + 33 * i)).hands
+        assert len(hands) == 2
+        names.append([hand.id for hand in sorted(hands, key=lambda hand: hand.cube_center.x)])
+    assert len(set(names[0])) == 2 and names == [names[0]] * 4
+    one = rig.answer(publish, image(np.where(np.arange(WIDTH) < WIDTH / 2, two_hands(0.64, 0.59), 3.0), 1200)).hands
+    assert [hand.id for hand in one] == names[0][:1]
+    back = rig.answer(publish, image(two_hands(0.64, 0.59), 1233)).hands
+    assert len(back) == 2 and back[0].id == names[0][0] and back[1].id not in names[0]

@@ -104,7 +104,7 @@ def candidates(depth: NDArray[np.float32], intrinsics: Intrinsics, *, side: floa
             piece = labels == label
             if float(np.sum(np.square(z[piece]))) * scene.pixel_area < MIN_AREA_M2:
                 continue
-            center = _settle(scene, scene.centroid(z, piece, slice(None), slice(None)), side)
+            center = _settle(scene, unseen, scene.centroid(z, piece, slice(None), slice(None)), side)
             again = any(np.linalg.norm(center - cube.center) < side / 3 for cube in found)
             if not again and _may_hold_a_hand(scene, center, side):
                 found.append(Cube((float(center[0]), float(center[1]), float(center[2])), side))
@@ -120,10 +120,14 @@ def detect(depth: NDArray[np.float32], intrinsics: Intrinsics, *, max_hands: int
     return list(islice(candidates(depth, intrinsics, **where), max_hands))
 
 
-def _settle(scene: _Scene, center: NDArray[np.float64], side: float) -> NDArray[np.float64]:
-    """Move a cube to the centre of mass of what it holds (original code; the paper trains on such centres)."""
+def _settle(scene: _Scene, unseen: NDArray[np.bool_], center: NDArray[np.float64], side: float) -> NDArray[np.float64]:
+    """Move a cube to the centre of mass of what it holds (original code; the paper trains on such centres).
+
+    What an earlier cube held does not count: an elbow that was judged already must not draw the next cube to itself.
+    """
     for _ in range(_ITERATIONS):
         z, inside, rows, cols = scene.inside(center, side)
+        inside &= unseen[rows, cols]
         if not inside.any():
             break
         center = scene.centroid(z, inside, rows, cols)

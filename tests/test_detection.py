@@ -111,3 +111,13 @@ def test_regions_of_interest_replace_the_search(empty):
     assert cube.center[2] == pytest.approx(0.87, abs=0.02)
     assert detect(empty, CAMERA, regions=[(0, 0, 50, 50)]) == []
     assert detect(empty, CAMERA, regions=[(-500, -500, 50, 50)]) == []
+
+
+def test_an_arm_that_reaches_towards_the_camera_does_not_hide_its_hand(empty):
+    """The elbow is nearest and found first; the next cube is around the hand at the far end of the arm."""
+    hand = np.array([0.0, -0.2, 0.75])
+    for share in np.linspace(0, 1, 30):
+        add_sphere(empty, np.array([0.0, 0.1, 0.6]) * (1 - share) + hand * share, 0.035)
+    first, second = detect(empty, CAMERA, max_hands=2)
+    assert first.center[2] < 0.65
+    assert np.linalg.norm(second.center - hand) < 0.08

@@ -28,6 +28,8 @@ from hand_pose_ros.synthetic.stages import CROP, CUBE_SIDE, Ingredients, Motion,
 SPLITS = ('train', 'val', 'test')
 LEFT, RIGHT = 1, 2  # as in the message HandJoints
 
+_ELSEWHERE = 0.12  # share of samples with a hand whose cube is to be of something else, where there is anything
+
 # Behind its surface lies a joint that can be seen: at most about its flesh (m, for a hand of 0.175 m).
 _FLESH = torch.tensor([0.034] + [0.034, 0.024, 0.016, 0.015] + [0.026, 0.017, 0.015, 0.014] * 4)
 
@@ -83,19 +85,19 @@ class SyntheticHands:
     def _chunk(self, seeds: Tensor) -> dict[str, Tensor]:
         stage = self._stages.build(seeds)
         scene = stage.scene
-        center, side = self._cubes(stage)
+        center, side, present = self._cubes(stage)
         view, inside = stage.window(center, side)
         clean, own = self._stages.draw(stage, view, center[:, 2] + side / 2)
         clean = torch.where(inside, clean, 0)
         depth = self._sense(stage, clean, view)
         joints = to_cube(scene.joints, center, side)
-        visible = self._visible(scene, view, clean, own, inside)
+        visible = self._visible(scene, view, clean, own, inside) & present[:, None]
         flip = torch.where(stage.mirrored, -1.0, 1.0)[:, None] * torch.tensor([1.0, 0, 0], device=self.device)
         flip = flip + torch.tensor([0, 1.0, 1.0], device=self.device)
-        there = scene.present[:, None, None]
+        there = present[:, None, None]
         return {'patch': crop(depth, center, side, view), 'joints': torch.where(there, joints, 0),
                 'joints_m': torch.where(there, scene.joints * flip[:, None], 0), 'cube_center': center * flip,
-                'cube_side': side, 'visible': visible, 'hand_present': scene.present,
+                'cube_side': side, 'visible': visible, 'hand_present': present,
                 'side': torch.where(stage.mirrored, LEFT, RIGHT), 'sensor': stage.sensor}
 
     def _sense(self, stage: Stage, clean: Tensor, view: View, frame: int = 0) -> Tensor:
@@ -103,19 +105,27 @@ class SyntheticHands:
             return depth_of(clean)
         return sense(clean, stage.seeds, stage.sensor, view.fx, stage.mirrored, frame)
 
-    def _cubes(self, stage: Stage) -> tuple[Tensor, Tensor]:
-        """Centres (B, 3) and sides (B,) of the crops: half as the detector finds them, half as tracking would."""
+    def _cubes(self, stage: Stage) -> tuple[Tensor, Tensor, Tensor]:
+        """Centres (B, 3) and sides (B,) of the crops, and whether they are of a hand (B,).
+
+        Half are as the detector finds the hand and half as tracking would; some are of something else in the scene,
+        from which a network learns to tell a hand from an elbow, a head or a table.
+        """
         rng = Random(stage.seeds).fork(CROP)
         middle = stage.scene.joints.mean(1)
         side = CUBE_SIDE * rng.uniform(low=0.85, high=1.2)
         if not self.ingredients.detector:
-            return middle, side
+            return middle, side, stage.scene.present
         tail = torch.where(rng.chance(0.1), 2.2, 1.0)[:, None]
         tracked = middle + (rng.normal(3, std=0.008) * tail).clamp(-0.025, 0.025)
-        found = self._stages.detect(stage) + rng.normal(3, std=0.003)
-        astray = (to_cube(middle[:, None], found, torch.full_like(side, CUBE_SIDE))[:, 0].abs() > 0.6).any(1)
-        use = rng.chance(0.5) & ~(astray & stage.scene.present)
-        return torch.where(use[:, None], found, tracked), side
+        present, elsewhere = stage.scene.present, rng.chance(_ELSEWHERE) & stage.scene.present
+        if stage.scene.others is not None:
+            elsewhere[stage.scene.others.samples] = False  # what else is there may be a hand
+        found = self._stages.detect(stage, elsewhere) + rng.normal(3, std=0.003)
+        off = to_cube(middle[:, None], found, torch.full_like(side, CUBE_SIDE))[:, 0].abs().amax(1)
+        elsewhere &= off > 1.2
+        use = elsewhere | (rng.chance(0.5) & ~((off > 0.6) & present))
+        return torch.where(use[:, None], found, tracked), side, present & ~elsewhere
 
     def _visible(self, scene: Scene, view: View, clean: Tensor, own: Tensor, inside: Tensor) -> Tensor:
         u, v = view.project(scene.joints)

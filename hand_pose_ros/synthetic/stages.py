@@ -31,7 +31,7 @@ _NEGATIVES = 0.05  # share of samples without a hand
 _FOREARM = 6  # as a part of the skin
 _SECOND_HAND = 0.08  # share of samples with another hand nearby
 
-_SHAPE, _POSE, _VIEW, _CAMERA, _FURNITURE, _SECOND, CROP, _MOTION = range(8)  # streams of random numbers
+_SHAPE, _POSE, _VIEW, _CAMERA, _FURNITURE, _SECOND, CROP, _MOTION, _PAST = range(9)  # streams of random numbers
 
 
 @dataclass(frozen=True)
@@ -205,15 +205,20 @@ class Stages:
         placed, _ = scenes.place(vertices * mirror, joints * mirror, rotation, position)
         stage.scene.others = scenes.Others(placed, chosen, left)
 
-    def detect(self, stage: Stage) -> Tensor:
-        """Where the product's detector settles, (B, 3) in metres, found in a coarse image around the hand."""
+    def detect(self, stage: Stage, elsewhere: Tensor) -> Tensor:
+        """Where the product's detector settles, (B, 3) in metres, found in a coarse image around the hand.
+
+        Args:
+            elsewhere: (B,) bool, look past the hand, as the detector does once an object was judged: at the arm, or,
+                behind a random distance, at the body or what else is there.
+        """
         x, y, z = stage.position.unbind(1)
         focal = _COARSE / _COARSE_SIDE * z
         middle = (_COARSE - 1) / 2
         view = View(focal, focal, middle - x / z * focal, middle - y / z * focal, _COARSE, _COARSE)
         scene = stage.scene
         hand = scenes.splat(scene.vertices[:, self._drawn], view)
-        solids = scenes.draw_solids(scene, view, stage.position[:, 2] + CUBE_SIDE)
+        solids = scenes.draw_solids(scene, view, z + torch.where(elsewhere, 3, 1) * CUBE_SIDE)
         image = torch.maximum(solids, torch.where(scene.present[:, None, None], hand, 0))
         if scene.others is not None:
             samples = scene.others.samples
@@ -221,7 +226,14 @@ class Stages:
         fx, fy, cx, cy, width, height = (t[:, None, None] for t in stage.camera())
         column, row = view.rays[0] * fx + cx, view.rays[1] * fy + cy
         seen = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        return settle(depth_of(torch.where(seen, image, 0)), view, CUBE_SIDE, _NEAREST, otherwise=stage.position)
+        depth = depth_of(torch.where(seen, image, 0))
+        past = Random(stage.seeds).fork(_PAST)
+        behind = z + torch.where(past.chance(0.5), 0.3 * past.uniform(), -3.0)
+        hand_x, hand_y, hand_z = (t[:, None, None] for t in scene.joints.mean(1).unbind(1))
+        cut = ((view.rays[0] * depth - hand_x).abs().maximum((view.rays[1] * depth - hand_y).abs()).maximum(
+            (depth - hand_z).abs()) < CUBE_SIDE / 2) | (depth < behind[:, None, None])
+        depth = torch.where(cut & elsewhere[:, None, None], 0, depth)
+        return settle(depth, view, CUBE_SIDE, _NEAREST, otherwise=stage.position)
 
     def draw(self, stage: Stage, view: View, back: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Nearness of everything, and of the hand alone."""

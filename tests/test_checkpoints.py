@@ -125,6 +125,15 @@ def test_pickles_are_refused_unread(write, tmp_path, monkeypatch):
     assert not (tmp_path / "trap-was-run").exists()
 
 
+def test_a_header_whose_length_looks_like_a_pickle_is_none(tmp_path):
+    path, network = tmp_path / "x.safetensors", build("deep_prior")
+    save_checkpoint(path, network, {**METADATA, "note": ""})
+    missing = (0x80 - path.read_bytes()[0]) % 256  # the file begins with the length of its header
+    save_checkpoint(path, network, {**METADATA, "note": "x" * missing})
+    assert path.read_bytes()[:1] == b"\x80"
+    assert load_checkpoint(path).metadata["note"] == "x" * missing
+
+
 @pytest.mark.parametrize("damage", [
     lambda data: data[:len(data) // 2], lambda data: b"", lambda data: b"\xff" * 64, lambda data: data[:9]])
 def test_a_damaged_file_says_so(damage, file):

@@ -34,22 +34,21 @@ def label(bag: Path, out: Path, estimator: HandPoseEstimator, min_score: float) 
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0],
+                                     epilog='All other arguments go to hand-pose train.')
     parser.add_argument('--train', nargs='+', type=Path, required=True, metavar='BAG')
     parser.add_argument('--val', nargs='+', type=Path, required=True, metavar='BAG')
     parser.add_argument('--out', type=Path, required=True, metavar='FOLDER', help='gets bags/ and run/')
     parser.add_argument('--min-score', type=float, default=0.8, help='hands below are not learned from (0.8)')
-    parser.add_argument('--set', action='append', default=[], dest='overrides', metavar='KEY=VALUE',
-                        help='a value of the recipe, as of hand-pose train')
-    args = parser.parse_args()
+    args, more = parser.parse_known_args()
 
     estimator = HandPoseEstimator.from_pretrained()
     for split in ('train', 'val'):
         for number, bag in enumerate(getattr(args, split)):
             count = label(bag, args.out / 'bags' / split / f'{number}_{bag.stem}.mcap', estimator, args.min_score)
             print(f'{split}: {count} images of {bag}', flush=True)
-    overrides = ['dataset=bags', f'root={args.out / "bags"}', *args.overrides]
-    return hand_pose(['train', 'paper', '--out', str(args.out / 'run'), *(f'--set={item}' for item in overrides)])
+    return hand_pose(['train', 'paper', '--out', str(args.out / 'run'), '--set', 'dataset=bags',
+                      '--set', f'root={args.out / "bags"}', *more])
 
 
 if __name__ == '__main__':

@@ -1,0 +1,110 @@
+"""`hand-pose doctor` says what is there, and what is wrong, whatever state the installation is in."""
+
+import importlib
+import sys
+from pathlib import Path
+
+import pytest
+
+from hand_pose_ros import __version__
+from hand_pose_ros.cli import doctor, main
+from hand_pose_ros.models import build, checkpoints
+from hand_pose_ros.models.checkpoints import save_checkpoint
+from hand_pose_ros.resources import resource
+
+PROFILE = resource('config/fastdds_large_images.xml')
+
+
+@pytest.fixture
+def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of weights that holds the default ones."""
+    monkeypatch.setattr(checkpoints, 'WEIGHTS', tmp_path)
+    path = tmp_path / f'{checkpoints.DEFAULT}.safetensors'
+    save_checkpoint(path, build('deep_prior'), {'skeleton': 'hand21', 'cube_side': 0.3})
+    return path
+
+
+def report(capsys: pytest.CaptureFixture[str]) -> tuple[int, dict[str, list[str]]]:
+    """Exit code, and the lines about each thing with their level."""
+    code = main(['doctor'])
+    *lines, end = capsys.readouterr().out.splitlines()
+    about: dict[str, list[str]] = {}
+    for line in lines:
+        level, thing, text = line[:6].strip(), line[6:22].strip(), line[22:]
+        about.setdefault(thing, []).append(f'{level}: {text}')
+    assert end == 'nothing is wrong' if code == 0 else end.endswith('of these are wrong')
+    return code, about
+
+
+def test_a_good_installation(weights: Path, monkeypatch: pytest.MonkeyPatch,
+                             capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip('hand_pose_ros.msg', reason='needs ROS 2 and the compiled messages')
+    from hand_pose_ros.ros.qos import large_image_profile
+    monkeypatch.setenv(*large_image_profile())
+    monkeypatch.setattr(doctor, 'SHARED_MEMORY', Path('/nonexistent'))  # whatever this machine has
+    code, about = report(capsys)
+    assert code == 0
+    assert about['package'][0].startswith(f'ok: hand_pose_ros {__version__}')
+    assert 'torch' in about['libraries'][0] and 'rosbags' in about['libraries'][0]
+    assert about['weights'] == ['ok: hand_dense (default): deep_prior, hand21, cube of 0.3 m']
+    assert 'onnxruntime on the CPU' in about['device'][0] or 'cuda' in about['device'][0]
+    assert 'rmw_' in about['ROS 2'][0] and 'messages built' in about['ROS 2'][0]
+    assert '16384 kB' in about['DDS profile'][0]
+
+
+def test_missing_and_damaged_weights(weights: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    weights.write_bytes(weights.read_bytes()[:1000])
+    code, about = report(capsys)
+    assert code == 1 and about['weights'][0].startswith('WRONG: ') and 'damaged' in about['weights'][0]
+    weights.unlink()
+    code, about = report(capsys)
+    assert code == 1 and 'the default weights hand_dense are missing' in about['weights'][0]
+
+
+def test_without_ros_all_else_is_examined(weights: Path, monkeypatch: pytest.MonkeyPatch,
+                                          capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(importlib.util, 'find_spec', lambda name: None)
+    monkeypatch.delenv('ROS_DISTRO', raising=False)
+    code, about = report(capsys)
+    assert code == 0 and about['ROS 2'][0].startswith('note: none') and 'DDS profile' not in about
+    monkeypatch.setenv('ROS_DISTRO', 'jazzy')
+    code, about = report(capsys)
+    assert code == 1 and 'jazzy is sourced, but' in about['ROS 2'][0]
+
+
+def test_a_library_that_cannot_be_imported(weights: Path, monkeypatch: pytest.MonkeyPatch,
+                                           capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setitem(sys.modules, 'rosbags', None)
+    code, about = report(capsys)
+    assert code == 1 and 'rosbags cannot be imported' in about['libraries'][0] and 'numpy' in about['libraries'][1]
+
+
+def test_profiles_of_the_middleware(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip('rclpy', reason='needs ROS 2')
+    from hand_pose_ros.ros.qos import PROFILE_VARIABLES, large_image_profile
+    ours = large_image_profile()[0]
+    (other,) = set(PROFILE_VARIABLES) - {ours}
+
+    def lines() -> list[str]:
+        return [f'{level}: {text}' for level, text in doctor.CHECKS['DDS profile']()]
+
+    for name in PROFILE_VARIABLES:
+        monkeypatch.delenv(name, raising=False)
+    assert lines()[0].startswith('note: none') and str(PROFILE) in lines()[0]
+    monkeypatch.setenv(other, str(PROFILE))
+    assert lines()[0] == f'WRONG: {other} is set, which this ROS does not read: name it {ours}'
+    monkeypatch.setenv(ours, str(tmp_path / 'none.xml'))
+    assert lines()[0].startswith('WRONG') and 'none.xml cannot be read' in lines()[0]
+    small = tmp_path / 'small.xml'
+    small.write_text(PROFILE.read_text().replace('16777216', '524288'))
+    monkeypatch.setenv(ours, str(small))
+    assert lines()[0].startswith('note') and '512 kB, too small' in lines()[0]
+
+
+def test_too_little_shared_memory(weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+                                  capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip('rclpy', reason='needs ROS 2')
+    monkeypatch.setattr(doctor, 'SHARED_MEMORY', tmp_path)
+    monkeypatch.setattr(doctor, 'ENOUGH_SHARED_MEMORY', 1 << 60)
+    code, about = report(capsys)
+    assert code == 1 and 'too little for large images' in about['shared memory'][0]

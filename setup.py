@@ -24,7 +24,7 @@ else:
 
 NAME = 'hand_pose_ros'
 ROOT = Path(__file__).resolve().parent
-SHARE = ('package.xml', 'msg/*', 'config/*', 'demo/*', 'launch/*.py', 'rviz/*')  # as CMakeLists.txt installs them
+SHARE = ('package.xml', 'msg/*', 'config/*', 'demo/*', 'foxglove/*', 'launch/*.py', 'rviz/*')  # as CMakeLists.txt installs them
 
 
 def can_build_messages() -> bool:

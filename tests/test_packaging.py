@@ -22,7 +22,8 @@ CHECKOUT = Path(__file__).resolve().parents[1]
 PACKAGE = CHECKOUT / 'hand_pose_ros'
 FILES = sorted(path.relative_to(CHECKOUT).as_posix() for path in PACKAGE.rglob('*')
                if path.is_file() and '__pycache__' not in path.parts)
-SHARED = sorted(path.relative_to(CHECKOUT).as_posix() for folder in ('msg', 'config', 'demo', 'launch', 'rviz')
+SHARED = sorted(path.relative_to(CHECKOUT).as_posix()
+                for folder in ('msg', 'config', 'demo', 'foxglove', 'launch', 'rviz')
                 for path in (CHECKOUT / folder).glob('*') if path.is_file())
 MODULES = [path for path in FILES if path.endswith('.py')]
 

@@ -17,6 +17,7 @@ VERBS = {
     'demo': 'play the recorded bag that ships through the live node and show what comes out',
     'estimate': 'joints and pictures from a bag or from 16-bit depth PNGs',
     'estimator': 'the ROS 2 node',
+    'view': 'depth images and hands in 3D, live or from a bag',
     'replay': 'publish a bag on ROS topics',
     'evaluate': 'score a prediction file, or the estimator on a bag',
     'compare': 'several results side by side',

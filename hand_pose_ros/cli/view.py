@@ -1,0 +1,168 @@
+"""`hand-pose view`: depth images and hands in 3D, live or from a bag, for people without RViz and Foxglove."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hand_pose_ros.bags import DepthBag
+from hand_pose_ros.depth import to_units
+from hand_pose_ros.errors import HandPoseError, InputError
+from hand_pose_ros.geometry import Intrinsics
+from hand_pose_ros.markers import DELETE, SPHERE_LIST, Hand, HandMarkers, Marker
+from hand_pose_ros.skeleton import Skeleton
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+_EXAMPLES = """examples:
+  hand-pose view recording.mcap
+  hand-pose view recording.mcap --save recording.rrd     (open it later, or elsewhere, with: rerun recording.rrd)
+  hand-pose view --ros-args -r depth/image_rect:=/camera/camera/depth/image_rect_raw
+
+Without a bag it shows what a camera and the node `estimator` publish, until Ctrl-C.
+"""
+
+
+def add_parser(subparsers: Any) -> None:
+    """Declare the verb."""
+    parser = subparsers.add_parser(
+        'view', help='depth images and hands in 3D, live or from a bag', epilog=_EXAMPLES,
+        description='Show depth images and hands in 3D with Rerun: those of a bag, or of live topics.',
+        formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('bag', metavar='BAG', type=Path, nargs='?', help='a .bag, .mcap or .db3 file, or a ROS 2 '
+                        'folder: its hands are estimated; without it, live topics are shown')
+    parser.add_argument('--save', metavar='FILE', type=Path, help='write an .rrd file instead of opening the viewer')
+    parser.add_argument('--depth-scale', type=float, default=0.001, metavar='M', help='metres per depth unit (0.001)')
+    bag = parser.add_argument_group('with a bag')
+    bag.add_argument('--depth-topic', metavar='TOPIC', help='which of several depth topics')
+    bag.add_argument('--intrinsics', nargs=4, type=float, metavar=('FX', 'FY', 'CX', 'CY'),
+                     help='of the camera in pixels; for bags without camera_info')
+    bag.add_argument('--model', help='name of weights that ship, or a checkpoint (the default weights)')
+    bag.add_argument('--side', default='auto', choices=('auto', 'left', 'right'), help='which hand it is (auto)')
+    bag.add_argument('--max-hands', type=int, default=1, metavar='N', help='at most N hands per image (1)')
+    bag.add_argument('--min-score', type=float, default=0.3, metavar='S', help='leave out hands below it (0.3)')
+    live = parser.add_argument_group('live')
+    live.add_argument('--transport', default='raw', choices=('raw', 'compressedDepth', 'compressed'),
+                      help='of the depth images (raw)')
+    live.add_argument('--ros-args', nargs=argparse.REMAINDER, default=[], metavar='...',
+                      help='remappings (-r from:=to) and so on, as with ros2 run')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Show until the end of the bag, or until Ctrl-C; 1 if an image of the bag could not be used.
+
+    Raises:
+        HandPoseError: Rerun is not installed, there is no ROS to be live with, or the bag cannot be read.
+    """
+    if args.bag is not None:
+        return _view_bag(args)
+    from hand_pose_ros.ros.watch import watch  # says what is missing where there is no ROS
+    with Scene(args.save) as scene:
+        watch(scene.add_depth, scene.add_hands, args.transport, args.depth_scale, args.ros_args)
+    return 0
+
+
+def _view_bag(args: argparse.Namespace) -> int:
+    failed = 0
+    with DepthBag(args.bag, args.depth_topic, None, args.intrinsics, args.depth_scale) as bag:
+        from hand_pose_ros.estimator import HandPoseEstimator  # imports torch: not for --help and bad arguments
+        estimator = HandPoseEstimator.from_pretrained(args.model, side=args.side, max_hands=args.max_hands,
+                                                      min_score=args.min_score)
+        with Scene(args.save) as scene:
+            for frame in bag:
+                try:
+                    depth, intrinsics = frame.depth, frame.intrinsics
+                except InputError as error:
+                    failed += 1
+                    print(f'hand-pose view: {error}', file=sys.stderr)
+                    continue
+                scene.add_depth(frame.stamp_ns, depth, intrinsics)
+                scene.add_hands(frame.stamp_ns, estimator(depth, intrinsics, time_s=frame.stamp_ns / 1e9),
+                                estimator.skeleton)
+    return 1 if failed else 0
+
+
+class Scene:
+    """Depth images as a cloud of points, and hands as markers among them, in the optical frame of the camera.
+
+    Args:
+        path: of the .rrd file, which is there when the scene is left without an error; None opens the viewer.
+
+    Raises:
+        HandPoseError: Rerun is not installed, or the file cannot be written.
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        try:
+            import rerun
+            from rerun import blueprint
+        except ImportError as error:
+            raise HandPoseError("hand-pose view needs Rerun: pip install 'hand_pose_ros[view]' (or rerun-sdk)"
+                                ) from error
+        self._rerun, self._path = rerun, path
+        self._markers: HandMarkers | None = None
+        views = blueprint.Horizontal(blueprint.Spatial3DView(origin='/', name='hands in 3D'), blueprint.Spatial2DView(
+            origin='/camera', contents=['/camera/**', '/hands/**'], name='depth image'))
+        layout = blueprint.Blueprint(views, collapse_panels=True)
+        self._stream = rerun.RecordingStream('hand_pose_ros')
+        if path is None:
+            self._stream.spawn(default_blueprint=layout)
+        else:
+            self._part = path.with_name(f'.{path.name}.part')
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                self._part.touch()
+            except OSError as error:
+                raise HandPoseError(f'{path}: cannot be written ({error.strerror}): give --save another place'
+                                    ) from error
+            self._stream.save(self._part, default_blueprint=layout)
+        self._stream.log('/', rerun.ViewCoordinates.RDF, static=True)
+
+    def add_depth(self, stamp_ns: int, depth: NDArray[np.float32], intrinsics: Intrinsics) -> None:
+        """Show a depth image (H, W) in metres."""
+        self._at(stamp_ns)
+        self._stream.log('camera', self._rerun.Pinhole(
+            width=intrinsics.width, height=intrinsics.height, focal_length=(intrinsics.fx, intrinsics.fy),
+            principal_point=(intrinsics.cx, intrinsics.cy), camera_xyz=self._rerun.ViewCoordinates.RDF))
+        self._stream.log('camera/depth', self._rerun.DepthImage(to_units(depth, 0.001), meter=1000.0))
+
+    def add_hands(self, stamp_ns: int, hands: Sequence[Hand], skeleton: Skeleton) -> None:
+        """Show the hands of an image, and take away those that are gone."""
+        self._at(stamp_ns)
+        if self._markers is None:
+            self._markers = HandMarkers(skeleton)
+        for marker in self._markers.update(hands):
+            self._stream.log(f'hands/{marker.namespace}', self._shape(marker))
+
+    def __enter__(self) -> Scene:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, _: BaseException | None, __: TracebackType | None) -> None:
+        self._stream.flush()
+        self._stream.disconnect()
+        if self._path is None:
+            return
+        if kind is None:
+            os.replace(self._part, self._path)
+        else:
+            self._part.unlink(missing_ok=True)
+
+    def _at(self, stamp_ns: int) -> None:
+        self._stream.set_time('stamp', timestamp=np.datetime64(stamp_ns, 'ns'))
+
+    def _shape(self, marker: Marker) -> Any:
+        if marker.action == DELETE:
+            return self._rerun.Clear(recursive=False)
+        colors = np.rint(np.array(marker.colors) * 255).astype(np.uint8)
+        radius = marker.scale[0] / 2
+        if marker.type == SPHERE_LIST:
+            return self._rerun.Points3D(marker.points, radii=radius, colors=colors)
+        return self._rerun.LineStrips3D(marker.points.reshape(-1, 2, 3), radii=radius, colors=colors[::2])

@@ -1,0 +1,92 @@
+"""Listen to a camera and to the node `estimator`, and pass on what they publish, for `hand-pose view`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import rclpy
+from numpy.typing import NDArray
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+
+from hand_pose_ros.depth import decode_compressed, decode_image
+from hand_pose_ros.errors import HandPoseError, InputError
+from hand_pose_ros.estimator import HandEstimate
+from hand_pose_ros.geometry import Intrinsics
+from hand_pose_ros.msg import HandJointsArray
+from hand_pose_ros.ros import qos, topics
+from hand_pose_ros.ros.camera import Camera
+from hand_pose_ros.ros.conversions import hand_from_msg, stamp_ns
+from hand_pose_ros.ros.diagnostics import Statistics
+from hand_pose_ros.ros.params import Params
+from hand_pose_ros.skeleton import Skeleton, get_skeleton
+
+OnDepth = Callable[[int, NDArray[np.float32], Intrinsics], None]
+OnHands = Callable[[int, list[HandEstimate], Skeleton], None]
+
+
+def watch(on_depth: OnDepth, on_hands: OnHands, transport: str = 'raw', depth_scale: float = 0.001,
+          ros_args: Sequence[str] = ()) -> None:
+    """Call back, with stamps in ns, for each depth image and for the hands of each image, until Ctrl-C.
+
+    Args:
+        transport, depth_scale: as the parameters of the node `estimator`.
+        ros_args: remappings (`-r from:=to`) and so on.
+    """
+    rclpy.init(args=['--ros-args', *ros_args])
+    try:
+        _Watcher(on_depth, on_hands, transport, depth_scale).spin()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        rclpy.try_shutdown()
+
+
+class _Watcher:
+    """Node `view`. What cannot be shown is left out with a warning."""
+
+    def __init__(self, on_depth: OnDepth, on_hands: OnHands, transport: str, depth_scale: float) -> None:
+        self._node = rclpy.create_node('view')
+        self._on_depth, self._on_hands = on_depth, on_hands
+        self._params = Params(transport=transport, depth_scale=depth_scale, camera_info_timeout=0.0)
+        self._statistics = Statistics()
+        self._topic, info_topic = topics.input_topics(self._node, transport)
+        self._camera = Camera(info_topic)
+        image_type, self._decode = (Image, decode_image) if transport == 'raw' else (CompressedImage, decode_compressed)
+        topics.subscribe(self._node, CameraInfo, info_topic, self._camera.update, self._complain)
+        topics.subscribe(self._node, image_type, self._topic, self._image, self._complain)
+        self._node.create_subscription(HandJointsArray, 'hand/joints', self._hands, qos.RESULTS)
+        self._node.get_logger().info(f'showing {self._topic} and {self._node.resolve_topic_name("hand/joints")}')
+
+    def spin(self) -> None:
+        executor = SingleThreadedExecutor()
+        executor.add_node(self._node)
+        try:
+            executor.spin()
+        finally:
+            self._node.destroy_node()
+
+    def _image(self, image: Any) -> None:
+        try:
+            depth = self._decode(image, self._params.depth_scale, source=self._topic)
+            intrinsics = self._camera.intrinsics(depth.shape[1], depth.shape[0], self._params)
+        except InputError as error:
+            self._complain(str(error))
+        else:
+            self._on_depth(stamp_ns(image.header), depth, intrinsics)
+
+    def _hands(self, message: HandJointsArray) -> None:
+        try:
+            skeleton = get_skeleton(message.skeleton)
+            hands = [hand_from_msg(hand, skeleton) for hand in message.hands]
+        except HandPoseError as error:
+            self._complain(f'hands in frame {message.header.frame_id} cannot be shown ({error}): leave the parameter '
+                           'target_frame of the node empty')
+        else:
+            self._on_hands(stamp_ns(message.header), hands, skeleton)
+
+    def _complain(self, problem: str) -> None:
+        if self._statistics.is_news(problem):
+            self._node.get_logger().warning(problem)

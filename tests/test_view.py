@@ -1,0 +1,113 @@
+"""What `hand-pose view` promises: depth images and hands where they belong, in a file that Rerun reads."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from test_estimate import CAMERA, STAMPS, bag, depths, weights  # noqa: F401 (fixtures)
+
+from hand_pose_ros.bags import BagWriter
+from hand_pose_ros.cli import main
+from hand_pose_ros.estimator import HandPoseEstimator
+
+# ruff: noqa: F811 (a fixture from another file is imported, and then an argument)
+
+pytest.importorskip('rerun', reason="needs Rerun: pip install 'hand_pose_ros[view]'")
+
+
+def with_(weights):
+    return '--model', str(weights), '--min-score', '0'
+
+
+def recorded(path, entity, column):
+    """stamp in ns -> what was logged there, in the order of time."""
+    from rerun.chunk import RrdReader
+    rows = {}
+    for chunk in RrdReader(path).stream():
+        if chunk.entity_path == entity:
+            table = chunk.to_record_batch()
+            if column in table.schema.names:
+                stamps = table.column('stamp').cast('int64').to_pylist()
+                rows |= dict(zip(stamps, table.column(column).to_pylist(), strict=True))
+    return dict(sorted(rows.items()))
+
+
+def test_a_bag(tmp_path, bag, depths, weights):
+    out = tmp_path / 'made' / 'view.rrd'
+    assert main(['view', str(bag), '--save', str(out), *with_(weights), '--side', 'left']) == 0
+    assert [path.name for path in out.parent.iterdir()] == ['view.rrd']
+    images = recorded(out, '/camera/depth', 'DepthImage:buffer')
+    assert list(images) == STAMPS
+    for image, depth in zip(images.values(), depths, strict=True):
+        millimetres = np.frombuffer(bytes(np.array(image, np.uint8)), np.uint16).reshape(depth.shape)
+        np.testing.assert_allclose(millimetres * 0.001, depth, atol=0.00051)
+    [[matrix]] = list(recorded(out, '/camera', 'Pinhole:image_from_camera').values())[:1]
+    np.testing.assert_allclose(np.array(matrix).reshape(3, 3).T, [[140, 0, 80], [0, 140, 60], [0, 0, 1]])
+    estimator = HandPoseEstimator.from_pretrained(weights, min_score=0.0, side='left')
+    joints = recorded(out, '/hands/hand_1/joints', 'Points3D:positions')
+    assert list(joints) == STAMPS
+    for stamp, points in joints.items():
+        [hand] = estimator(depths[STAMPS.index(stamp)], CAMERA, time_s=stamp / 1e9)
+        np.testing.assert_allclose(points, hand.joints, atol=1e-6)
+    assert len(recorded(out, '/hands/hand_1/bones', 'LineStrips3D:strips')[STAMPS[0]]) == 20
+
+
+def test_a_lost_hand_is_taken_away(tmp_path, depths, weights):
+    with BagWriter(tmp_path / 'lost.mcap') as writer:
+        for stamp, depth in zip(STAMPS, [depths[0], np.full_like(depths[0], 3)], strict=False):
+            writer.write_depth(stamp, 'camera', depth, CAMERA)
+    out = tmp_path / 'view.rrd'
+    assert main(['view', str(tmp_path / 'lost.mcap'), '--save', str(out), *with_(weights)]) == 0
+    assert list(recorded(out, '/hands/hand_1/joints', 'Points3D:positions')) == STAMPS[:1]
+    assert list(recorded(out, '/hands/hand_1/joints', 'Clear:is_recursive')) == STAMPS[1:2]
+
+
+def test_a_failure_leaves_no_file_and_is_one_sentence(tmp_path, bag, weights, capsys, monkeypatch):
+    assert main(['view', str(tmp_path / 'missing.bag'), '--save', str(tmp_path / 'a.rrd')]) == 1
+    assert 'missing.bag: there is no such bag' in capsys.readouterr().err
+    (tmp_path / 'file').touch()
+    assert main(['view', str(bag), '--model', str(weights), '--save', str(tmp_path / 'file' / 'a.rrd')]) == 1
+    assert '--save' in capsys.readouterr().err
+    data = bag.read_bytes()
+    cut = tmp_path / 'cut.mcap'
+    cut.write_bytes(data[:len(data) * 2 // 3])
+    assert main(['view', str(cut), '--model', str(weights), '--save', str(tmp_path / 'a.rrd')]) == 1
+    assert 'cut.mcap' in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, 'rerun', None)
+    assert main(['view', str(bag), '--model', str(weights)]) == 1
+    assert 'rerun-sdk' in capsys.readouterr().err
+    assert not list(tmp_path.glob('*.rrd*')) and not list(tmp_path.glob('.*rrd*'))
+
+
+def test_live(tmp_path, weights, ros_domain):
+    pytest.importorskip('rclpy', reason='needs ROS 2')
+    pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
+    from test_node import Rig, camera_info, depth_with_hand, image
+    out = tmp_path / 'live.rrd'
+    code = 'import sys; from hand_pose_ros.cli import main; sys.exit(main())'
+    process = subprocess.Popen([sys.executable, '-c', code, 'view', '--save', str(out)], env=dict(os.environ))
+    rig = Rig(weights)
+    try:
+        rig.start(side='right')
+        publish = rig.camera(info=camera_info())
+        rig.until(lambda: rig.client.count_subscribers('/depth/image_rect') == 2
+                  and rig.client.count_subscribers('/hand/joints') == 2, 'the viewer', seconds=90)
+        answers, part = {}, tmp_path / '.live.rrd.part'
+        for i in range(200):  # best effort: the first images may not reach it
+            hand = rig.answer(publish, image(depth_with_hand(), 1000 + 33 * i)).hands[0]
+            answers[(1000 + 33 * i) * 1_000_000] = [(p.x, p.y, p.z) for p in hand.joints]
+            if i >= 20 and part.exists() and part.stat().st_size > 100_000:
+                break
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 0
+    finally:
+        process.kill()
+        rig.close()
+    images = recorded(out, '/camera/depth', 'DepthImage:buffer')
+    joints = recorded(out, f'/hands/{hand.id}/joints', 'Points3D:positions')
+    assert images and joints and set(images) | set(joints) <= set(answers)
+    for stamp, points in joints.items():
+        np.testing.assert_allclose(points, answers[stamp], atol=1e-6)

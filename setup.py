@@ -24,7 +24,8 @@ else:
 
 NAME = 'hand_pose_ros'
 ROOT = Path(__file__).resolve().parent
-SHARE = ('package.xml', 'msg/*', 'config/*', 'demo/*', 'foxglove/*', 'launch/*.py', 'rviz/*')  # as CMakeLists.txt installs them
+# What CMakeLists.txt installs, too.
+SHARE = ('package.xml', 'msg/*', 'config/*', 'demo/*', 'foxglove/*', 'launch/*.py', 'rviz/*')
 
 
 def can_build_messages() -> bool:

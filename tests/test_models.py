@@ -13,8 +13,8 @@ from hand_pose_ros.models.dense import cells, decode, encode
 from hand_pose_ros.models.prior import fit_prior
 from hand_pose_ros.models.refiner import Refiner
 
-POSE_NETWORKS = ("shallow", "deep", "deep_prior", "multi_scale", "resnet", "hand_dense")
-REFINERS = ("std_ref", "or_ref")
+POSE_NETWORKS = ('shallow', 'deep', 'deep_prior', 'multi_scale', 'resnet', 'hand_dense')
+REFINERS = ('std_ref', 'or_ref')
 
 
 @pytest.fixture(autouse=True)
@@ -29,7 +29,7 @@ def parameters(network: nn.Module) -> int:
 
 def hand_patches(count: int) -> torch.Tensor:
     """Patches with a sloping disc, like a palm, before the background."""
-    y, x = torch.meshgrid(*[torch.linspace(-1, 1, 128)] * 2, indexing="ij")
+    y, x = torch.meshgrid(*[torch.linspace(-1, 1, 128)] * 2, indexing='ij')
     centers, slopes = torch.rand(count, 2, 1, 1) * 0.4 - 0.2, torch.rand(count, 2, 1, 1) - 0.5
     inside = (x - centers[:, 0]) ** 2 + (y - centers[:, 1]) ** 2 < 0.4
     depth = slopes[:, 0] * x + slopes[:, 1] * y + 0.02 * torch.rand(count, 128, 128)
@@ -37,19 +37,19 @@ def hand_patches(count: int) -> torch.Tensor:
 
 
 # Deep, with and without the prior: (joints, direct, prior), counted from the layers of the original network.
-@pytest.mark.parametrize(("joints", "direct", "prior"), [
+@pytest.mark.parametrize(('joints', 'direct', 'prior'), [
     (14, 2_087_306, 2_076_308), (16, 2_093_456, 2_076_494), (21, 2_108_831, 2_076_959)])
 def test_deep_has_the_original_number_of_parameters(joints, direct, prior):
-    assert parameters(build("deep", joints=joints)) == direct
-    assert parameters(build("deep", joints=joints, bottleneck=30)) == prior
-    assert parameters(build("deep_prior", joints=joints)) == prior
+    assert parameters(build('deep', joints=joints)) == direct
+    assert parameters(build('deep', joints=joints, bottleneck=30)) == prior
+    assert parameters(build('deep_prior', joints=joints)) == prior
 
 
 def test_the_other_networks_have_the_original_number_of_parameters():
-    assert parameters(build("center_refiner")) == 3_567_651
+    assert parameters(build('center_refiner')) == 3_567_651
     # The same branches with 63 outputs instead of 3.
-    assert parameters(build("multi_scale")) == 3_567_651 + 60 * 1025
-    as_built, as_meant = (parameters(build("resnet", joints=14, last_stride=stride)) for stride in (1, 2))
+    assert parameters(build('multi_scale')) == 3_567_651 + 60 * 1025
+    as_built, as_meant = (parameters(build('resnet', joints=14, last_stride=stride)) for stride in (1, 2))
     assert as_built == pytest.approx(18.71e6, abs=5e3)
     assert as_meant == pytest.approx(6.2e6, abs=5e4)
 
@@ -65,27 +65,27 @@ def test_layer_shapes_of_deep_and_multi_scale():
         return found
 
     patch = torch.zeros(1, 1, 128, 128)
-    assert shapes(build("deep", bottleneck=30).features, patch) == [(8, 31, 31), (8, 13, 13), (8, 11, 11)]
-    assert shapes(build("multi_scale").features, patch) == [
+    assert shapes(build('deep', bottleneck=30).features, patch) == [(8, 31, 31), (8, 13, 13), (8, 11, 11)]
+    assert shapes(build('multi_scale').features, patch) == [
         (8, 31, 31), (8, 13, 13), (8, 11, 11), (8, 30, 30), (8, 13, 13), (8, 11, 11), (8, 14, 14), (8, 10, 10),
         (8, 8, 8)]
-    assert shapes(build("deep", bottleneck=30).head, torch.zeros(1, 968)) == [
+    assert shapes(build('deep', bottleneck=30).head, torch.zeros(1, 968)) == [
         (1024,), (1024,), (1024,), (1024,), (30,), (63,)]
 
 
 def test_initialisation_follows_the_original():
-    network = build("deep_prior")
+    network = build('deep_prior')
     first, third = network.features[0][0], network.features[2][0]
     assert first.weight.std().item() == pytest.approx((2 / 25) ** 0.5, rel=0.2)
     assert third.weight.std().item() == pytest.approx((2 / 72) ** 0.5, rel=0.1)
     assert network.head.hidden[0].weight.std().item() == pytest.approx(0.01, rel=0.01)
     limit = (6 / (1024 + 30)) ** 0.5
     assert 0.99 * limit < network.head.output.weight.abs().max().item() <= limit
-    assert all((p == 0).all() for name, p in network.named_parameters() if name.endswith("bias"))
+    assert all((p == 0).all() for name, p in network.named_parameters() if name.endswith('bias'))
 
 
-@pytest.mark.parametrize("architecture", POSE_NETWORKS)
-@pytest.mark.parametrize("joints", [14, 21])
+@pytest.mark.parametrize('architecture', POSE_NETWORKS)
+@pytest.mark.parametrize('joints', [14, 21])
 def test_every_pose_network_maps_patches_to_joints_and_learns(architecture, joints):
     network = build(architecture, joints=joints)
     patches = hand_patches(4)
@@ -95,11 +95,11 @@ def test_every_pose_network_maps_patches_to_joints_and_learns(architecture, join
     answer.square().sum().backward()
     moving = [p.grad is not None and bool(p.grad.abs().sum() > 0) for p in network.parameters()]
     # hand_dense has a summary (confidence, side, ...) that the joints do not depend on.
-    assert sum(moving) >= len(moving) - (2 if architecture == "hand_dense" else 0)
+    assert sum(moving) >= len(moving) - (2 if architecture == 'hand_dense' else 0)
 
 
-@pytest.mark.parametrize("architecture", ["shallow", "deep", "multi_scale", "resnet"])
-@pytest.mark.parametrize("bottleneck", [8, 30])
+@pytest.mark.parametrize('architecture', ['shallow', 'deep', 'multi_scale', 'resnet'])
+@pytest.mark.parametrize('bottleneck', [8, 30])
 def test_the_reconstruction_is_the_inverse_transform_of_the_prior_and_is_trained(architecture, bottleneck):
     poses = np.random.default_rng(0).normal(size=(200, 63)) * 0.3
     prior = fit_prior(poses, bottleneck)
@@ -132,29 +132,29 @@ def test_the_prior_equals_a_singular_value_decomposition():
 
 
 def test_mistakes_are_named():
-    with pytest.raises(HandPoseError, match=r"choose one of .*deep"):
-        build("deeper")
-    with pytest.raises(HandPoseError, match="does not take depth: it takes joints"):
-        build("deep", depth=3)
-    with pytest.raises(HandPoseError, match="without a bottleneck"):
-        build("deep").set_prior(np.zeros(63), np.zeros((30, 63)))
-    with pytest.raises(HandPoseError, match="does not fit a bottleneck of 30 and 21 joints"):
-        build("deep_prior").set_prior(np.zeros(42), np.zeros((30, 42)))
-    with pytest.raises(HandPoseError, match="30 components need"):
+    with pytest.raises(HandPoseError, match=r'choose one of .*deep'):
+        build('deeper')
+    with pytest.raises(HandPoseError, match='does not take depth: it takes joints'):
+        build('deep', depth=3)
+    with pytest.raises(HandPoseError, match='without a bottleneck'):
+        build('deep').set_prior(np.zeros(63), np.zeros((30, 63)))
+    with pytest.raises(HandPoseError, match='does not fit a bottleneck of 30 and 21 joints'):
+        build('deep_prior').set_prior(np.zeros(42), np.zeros((30, 42)))
+    with pytest.raises(HandPoseError, match='30 components need'):
         fit_prior(np.zeros((10, 63)), 30)
-    with pytest.raises(HandPoseError, match="not finite"):
+    with pytest.raises(HandPoseError, match='not finite'):
         fit_prior(np.full((100, 63), np.nan), 30)
 
 
 def test_build_remembers_everything_that_made_the_network():
-    network = build("deep_prior", joints=14)
-    assert network.architecture == "deep_prior"
-    assert network.config == {"joints": 14, "bottleneck": 30, "dropout": 0.3}
-    assert set(POSE_NETWORKS) | set(REFINERS) | {"center_refiner"} == set(ARCHITECTURES)
+    network = build('deep_prior', joints=14)
+    assert network.architecture == 'deep_prior'
+    assert network.config == {'joints': 14, 'bottleneck': 30, 'dropout': 0.3}
+    assert set(POSE_NETWORKS) | set(REFINERS) | {'center_refiner'} == set(ARCHITECTURES)
 
 
 def test_the_center_refiner_sees_fine_the_middle_and_coarsely_the_rest():
-    network = build("center_refiner").eval()
+    network = build('center_refiner').eval()
     patches = hand_patches(3)
     palm = network(patches)
     assert palm.shape == (3, 3)
@@ -177,7 +177,7 @@ def awake(architecture: str) -> Refiner:
     return refiner
 
 
-@pytest.mark.parametrize("architecture", REFINERS)
+@pytest.mark.parametrize('architecture', REFINERS)
 def test_all_joints_at_once_equal_joint_by_joint(architecture):
     refiner = awake(architecture)
     patches = hand_patches(3)
@@ -190,7 +190,7 @@ def test_all_joints_at_once_equal_joint_by_joint(architecture):
     torch.testing.assert_close(together, alone, atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("architecture", REFINERS)
+@pytest.mark.parametrize('architecture', REFINERS)
 def test_one_joint_equals_plain_convolutions_over_a_sampled_window(architecture):
     """The formula, written out once more with other means: grid_sample instead of indices, plain layers instead of
     grouped ones."""
@@ -208,7 +208,7 @@ def test_one_joint_equals_plain_convolutions_over_a_sampled_window(architecture)
         line = ((torch.arange(cells) + 0.5) / cells * 2 - 1) * reach
         grid = torch.stack([line.expand(cells, -1) + estimate[0, joint, 0],
                             line[:, None].expand(-1, cells) + estimate[0, joint, 1]], dim=-1)
-        x = F.grid_sample(depth, grid[None], mode="bilinear", padding_mode="border", align_corners=False)
+        x = F.grid_sample(depth, grid[None], mode='bilinear', padding_mode='border', align_corners=False)
         for module in branch:
             if isinstance(module, nn.Conv2d):
                 count = module.out_channels // 21
@@ -225,7 +225,7 @@ def test_one_joint_equals_plain_convolutions_over_a_sampled_window(architecture)
     torch.testing.assert_close(refiner(patch, estimate, iterations=1)[0, joint], expected, atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("architecture", REFINERS)
+@pytest.mark.parametrize('architecture', REFINERS)
 def test_the_refiner_iterates_from_its_own_answer(architecture):
     refiner, patches, estimates = awake(architecture), hand_patches(2), torch.rand(2, 21, 3) - 0.5
     once = refiner(patches, estimates, iterations=1)
@@ -233,7 +233,7 @@ def test_the_refiner_iterates_from_its_own_answer(architecture):
     torch.testing.assert_close(refiner(patches, estimates, iterations=0), estimates)
 
 
-@pytest.mark.parametrize("architecture", REFINERS)
+@pytest.mark.parametrize('architecture', REFINERS)
 def test_the_refiner_follows_the_hand(architecture):
     """What it adds depends on the surroundings of the joint alone: shift hand and estimate, and it stays the same."""
     refiner, patch = awake(architecture), hand_patches(1)
@@ -246,7 +246,7 @@ def test_the_refiner_follows_the_hand(architecture):
     torch.testing.assert_close(before, after, atol=1e-4, rtol=0)
 
 
-@pytest.mark.parametrize("architecture", REFINERS)
+@pytest.mark.parametrize('architecture', REFINERS)
 def test_each_joint_of_the_refiner_learns_from_its_own_error_only(architecture):
     refiner = build(architecture)
     answer = refiner(hand_patches(2), torch.zeros(2, 21, 3).requires_grad_())
@@ -256,7 +256,7 @@ def test_each_joint_of_the_refiner_learns_from_its_own_error_only(architecture):
 
 
 def test_orref_fits_in_twelve_megabytes_of_half_precision():
-    assert 2 * parameters(build("or_ref")) <= 12e6
+    assert 2 * parameters(build('or_ref')) <= 12e6
 
 
 def test_an_untrained_refiner_moves_nothing_far():
@@ -289,11 +289,11 @@ def test_dense_cells_are_in_cube_units():
 
 
 def test_dense_network_says_everything_and_survives_an_empty_patch():
-    network = build("hand_dense").eval()
+    network = build('hand_dense').eval()
     patches = torch.cat([hand_patches(2), torch.ones(1, 1, 128, 128)])
     answer = network.forward_full(patches)
     assert {name: tuple(answer[name].shape) for name in network.outputs} == {
-        "joints": (3, 21, 3), "confidence": (3, 21), "hand": (3,), "side": (3,), "size": (3,)}
+        'joints': (3, 21, 3), 'confidence': (3, 21), 'hand': (3,), 'side': (3,), 'size': (3,)}
     assert all(tensor.isfinite().all() for tensor in answer.values())
-    torch.testing.assert_close(network(patches), answer["joints"])
-    assert parameters(build("hand_dense", width=16)) < parameters(network) / 3
+    torch.testing.assert_close(network(patches), answer['joints'])
+    assert parameters(build('hand_dense', width=16)) < parameters(network) / 3

@@ -164,7 +164,7 @@ def check_installation(prefix: Path, site_packages: Path) -> None:
         'AMENT_PREFIX_PATH': f'{prefix}:{sys.prefix}',
         'PATH': f'{sys.prefix}/bin:{os.environ["PATH"]}',
     }
-    code = f'''
+    code = f"""
 import hand_pose_ros, hand_pose_ros.msg
 from ament_index_python.packages import get_package_prefix, get_package_share_directory
 from rclpy.serialization import deserialize_message, serialize_message
@@ -174,7 +174,7 @@ print(hand_pose_ros.__file__, hand_pose_ros.msg.__file__, *map(resource, {SHARED
       get_package_prefix('hand_pose_ros'), get_package_share_directory('hand_pose_ros'), sep='\\n')
 message = hand_pose_ros.msg.HandSkeleton(name='hand21', parents=[-1, 0])
 assert deserialize_message(serialize_message(message), type(message)) == message
-'''
+"""
     for line in run(sys.executable, '-c', code, cwd=prefix, **environment).split():
         assert Path(line).is_relative_to(prefix), line
     for name in ('estimator', 'evaluate', 'replay'):  # what `ros2 run hand_pose_ros NAME` starts

@@ -17,13 +17,13 @@ from hand_pose_ros.runtime.engine import Pipeline, TorchEngine
 
 MM_PER_UNIT = 150
 """A cube of 0.30 m has 150 mm from its centre to a face."""
-ARCHITECTURES = ("shallow", "deep", "deep_prior", "multi_scale", "resnet", "hand_dense")
+ARCHITECTURES = ('shallow', 'deep', 'deep_prior', 'multi_scale', 'resnet', 'hand_dense')
 
 
 def hand_patches(count: int, seed: int = 0) -> np.ndarray:
     """Patches with a sloping noisy disc, like a palm, before the background."""
     rng = np.random.default_rng(seed)
-    y, x = np.meshgrid(*[np.linspace(-1, 1, 128)] * 2, indexing="ij")
+    y, x = np.meshgrid(*[np.linspace(-1, 1, 128)] * 2, indexing='ij')
     patches = np.ones((count, 1, 128, 128))
     for patch in patches:
         inside = (x - rng.uniform(-0.2, 0.2)) ** 2 + (y - rng.uniform(-0.2, 0.2)) ** 2 < 0.4
@@ -35,7 +35,7 @@ def hand_patches(count: int, seed: int = 0) -> np.ndarray:
 def trained(architecture: str) -> torch.nn.Module:
     """A network that answers as a trained one does: normalised inside, joints inside the cube."""
     torch.manual_seed(0)
-    options = {"last_stride": 2, "blocks": 2} if architecture == "resnet" else {}
+    options = {'last_stride': 2, 'blocks': 2} if architecture == 'resnet' else {}
     network = build(architecture, **options).requires_grad_(False)
     patches = torch.from_numpy(hand_patches(8))
     for module in network.modules():
@@ -44,7 +44,7 @@ def trained(architecture: str) -> torch.nn.Module:
     network(patches)
     network.eval()
     scale = network(patches).abs().max()
-    if architecture == "hand_dense":
+    if architecture == 'hand_dense':
         network.maps.weight.mul_(2)
     else:
         for layer in (network.head.reconstruction or network.head.output,):
@@ -63,14 +63,14 @@ def assert_equal_in_half_precision(answer: np.ndarray, expected: np.ndarray, arc
     """To 0.5 mm. Deep networks amplify rounding when their weights are random, at single joints; there, on average."""
     error_mm = np.abs(answer - expected) * MM_PER_UNIT
     assert error_mm.mean() <= 0.2
-    if architecture not in ("resnet", "hand_dense"):
+    if architecture not in ('resnet', 'hand_dense'):
         assert error_mm.max() <= 0.5
 
 
-@pytest.mark.parametrize("architecture", ARCHITECTURES)
+@pytest.mark.parametrize('architecture', ARCHITECTURES)
 def test_the_cpu_engine_equals_plain_pytorch(architecture):
     network = trained(architecture)
-    plain, engine = TorchEngine(Pipeline(network)), make_engine(network, "cpu", num_threads=2)
+    plain, engine = TorchEngine(Pipeline(network)), make_engine(network, 'cpu', num_threads=2)
     for count in (1, 2, 5):
         patches = hand_patches(count, seed=count)
         expected = plain.run(patches)
@@ -81,11 +81,11 @@ def test_the_cpu_engine_equals_plain_pytorch(architecture):
         assert np.abs(answer - expected).max() * MM_PER_UNIT <= 0.05
 
 
-@pytest.mark.parametrize("refiner", ["std_ref", "or_ref"])
-@pytest.mark.parametrize("architecture", ["deep_prior", "hand_dense"])
+@pytest.mark.parametrize('refiner', ['std_ref', 'or_ref'])
+@pytest.mark.parametrize('architecture', ['deep_prior', 'hand_dense'])
 def test_the_cpu_engine_refines_as_plain_pytorch_does(architecture, refiner):
     network, second = trained(architecture), trained_refiner(refiner)
-    engine = make_engine(network, "cpu", num_threads=1, refiner=second)
+    engine = make_engine(network, 'cpu', num_threads=1, refiner=second)
     for count in (1, 3):
         patches = hand_patches(count, seed=count)
         with torch.inference_mode():
@@ -96,35 +96,35 @@ def test_the_cpu_engine_refines_as_plain_pytorch_does(architecture, refiner):
 
 
 def test_hands_do_not_influence_each_other():
-    engine = make_engine(trained("deep_prior"), "cpu", refiner=trained_refiner("or_ref"))
+    engine = make_engine(trained('deep_prior'), 'cpu', refiner=trained_refiner('or_ref'))
     patches = hand_patches(4)
     alone = np.concatenate([engine.run(patches[i:i + 1]) for i in range(4)])
     np.testing.assert_allclose(engine.run(patches), alone, atol=1e-5)
 
 
 def test_everything_the_network_says_comes_through():
-    network = trained("hand_dense")
+    network = trained('hand_dense')
     patches = hand_patches(2)
-    answer = make_engine(network, "cpu").run_full(patches)
+    answer = make_engine(network, 'cpu').run_full(patches)
     expected = network.forward_full(torch.from_numpy(patches))
-    assert set(answer) == {"joints", "confidence", "hand", "side", "size"}
+    assert set(answer) == {'joints', 'confidence', 'hand', 'side', 'size'}
     for name, array in answer.items():
         assert array.shape == tuple(expected[name].shape)
         np.testing.assert_allclose(array, expected[name], atol=1e-3)
-    assert set(make_engine(trained("shallow"), "cpu").run_full(patches)) == {"joints"}
+    assert set(make_engine(trained('shallow'), 'cpu').run_full(patches)) == {'joints'}
 
 
 def test_views_and_mirrored_patches_are_taken_as_they_are():
     """The estimator shows a left hand in the mirror: an array with a negative stride."""
-    engine, patches = make_engine(trained("deep_prior"), "cpu"), hand_patches(2)
+    engine, patches = make_engine(trained('deep_prior'), 'cpu'), hand_patches(2)
     mirrored = patches[..., ::-1]
     np.testing.assert_array_equal(engine.run(mirrored), engine.run(mirrored.copy()))
-    plain = TorchEngine(Pipeline(trained("deep_prior")))
+    plain = TorchEngine(Pipeline(trained('deep_prior')))
     np.testing.assert_array_equal(plain.run(mirrored), plain.run(mirrored.copy()))
 
 
 def test_an_answer_is_kept_when_the_next_image_comes():
-    engine = make_engine(trained("deep_prior"), "cpu")
+    engine = make_engine(trained('deep_prior'), 'cpu')
     first = engine.run(hand_patches(1, seed=1))
     copy = first.copy()
     engine.run(hand_patches(1, seed=2))
@@ -132,59 +132,59 @@ def test_an_answer_is_kept_when_the_next_image_comes():
 
 
 def test_the_network_given_stays_as_it_is():
-    network = build("deep_prior")
-    make_engine(network, "cpu")
+    network = build('deep_prior')
+    make_engine(network, 'cpu')
     assert network.training
     assert all(p.requires_grad for p in network.parameters())
 
 
-@pytest.mark.parametrize("patches", [
+@pytest.mark.parametrize('patches', [
     np.zeros((1, 128, 128), np.float32), np.zeros((1, 1, 64, 64), np.float32), np.zeros((1, 1, 128, 128))])
 def test_other_patches_are_refused(patches):
-    with pytest.raises(InputError, match="patches must be"):
-        make_engine(trained("shallow"), "cpu").run(patches)
+    with pytest.raises(InputError, match='patches must be'):
+        make_engine(trained('shallow'), 'cpu').run(patches)
 
 
 def test_the_choice_is_logged_with_its_reason(caplog):
-    network = build("shallow")
-    with caplog.at_level(logging.INFO, "hand_pose_ros.runtime"):
+    network = build('shallow')
+    with caplog.at_level(logging.INFO, 'hand_pose_ros.runtime'):
         engine = make_engine(network, num_threads=1)
     assert engine.name in caplog.text
-    assert "no GPU was found; 1 threads" in caplog.text or "a GPU was found" in caplog.text
+    assert 'no GPU was found; 1 threads' in caplog.text or 'a GPU was found' in caplog.text
 
 
 def test_a_device_that_is_not_there_is_named():
-    network = build("shallow")
+    network = build('shallow')
     with pytest.raises(HandPoseError, match="device 'quantum' cannot be used here"):
-        make_engine(network, "quantum")
-    with pytest.raises(HandPoseError, match="num_threads is 0"):
-        make_engine(network, "cpu", num_threads=0)
+        make_engine(network, 'quantum')
+    with pytest.raises(HandPoseError, match='num_threads is 0'):
+        make_engine(network, 'cpu', num_threads=0)
     if not torch.cuda.is_available():
-        with pytest.raises(HandPoseError, match="finds no GPU"):
-            make_engine(network, "cuda")
+        with pytest.raises(HandPoseError, match='finds no GPU'):
+            make_engine(network, 'cuda')
 
 
-@pytest.mark.parametrize(("cores", "threads"), [(1, 1), (2, 2), (4, 3), (8, 4), (64, 4)])
+@pytest.mark.parametrize(('cores', 'threads'), [(1, 1), (2, 2), (4, 3), (8, 4), (64, 4)])
 def test_threads_leave_room_for_the_rest(cores, threads, monkeypatch):
-    monkeypatch.setattr("os.sched_getaffinity", lambda pid: set(range(cores)), raising=False)
+    monkeypatch.setattr('os.sched_getaffinity', lambda pid: set(range(cores)), raising=False)
     assert default_threads() == threads
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU")
-@pytest.mark.parametrize("refiner", [None, "or_ref"])
-@pytest.mark.parametrize("architecture", ARCHITECTURES)
+@pytest.mark.skipif(not torch.cuda.is_available(), reason='needs a CUDA GPU')
+@pytest.mark.parametrize('refiner', [None, 'or_ref'])
+@pytest.mark.parametrize('architecture', ARCHITECTURES)
 def test_the_gpu_engine_equals_plain_pytorch(architecture, refiner):
     network = trained(architecture)
     second = trained_refiner(refiner) if refiner else None
-    engine = make_engine(network, "cuda", refiner=second)
+    engine = make_engine(network, 'cuda', refiner=second)
     plain = TorchEngine(Pipeline(network, second))
     for count in (1, 3, 2, 9):  # graphs of 1, 4, 2 and 16
         patches = hand_patches(count, seed=count)
         assert_equal_in_half_precision(engine.run(patches), plain.run(patches), architecture)
 
 
-@pytest.mark.parametrize("refiner", [None, "or_ref"])
-@pytest.mark.parametrize("architecture", ARCHITECTURES)
+@pytest.mark.parametrize('refiner', [None, 'or_ref'])
+@pytest.mark.parametrize('architecture', ARCHITECTURES)
 def test_half_precision_changes_no_joint_by_half_a_millimetre(architecture, refiner):
     """What the GPU engine computes, as far as arithmetic goes, for machines without a GPU."""
     second = trained_refiner(refiner) if refiner else None
@@ -199,20 +199,20 @@ def test_half_precision_changes_no_joint_by_half_a_millimetre(architecture, refi
 
 @pytest.mark.timeout(300)  # nine seconds of CPU time, whatever else the machine does
 def test_bench_measures_every_kind_of_row(tmp_path, capsys):
-    file = tmp_path / "speed.json"
-    assert main(["bench", "--quick", "--threads", "1", "--json", str(file)]) == 0
-    rows = json.loads(file.read_text())["rows"]
+    file = tmp_path / 'speed.json'
+    assert main(['bench', '--quick', '--threads', '1', '--json', str(file)]) == 0
+    rows = json.loads(file.read_text())['rows']
     printed = capsys.readouterr().out
     assert all(name in printed for name in rows)
-    for name in ("network deep_prior: engine", "network deep_prior: pytorch", "network deep_prior: floor",
-                 "refine or_ref x2: engine", "refine or_ref x2: pytorch, joint by joint", "frame deep_prior",
-                 "stage deep_prior: decode", "stage deep_prior: detect", "stage deep_prior: crop",
-                 "stage deep_prior: predict", "stage deep_prior: uncrop"):
-        assert 0 < rows[name]["p50_ms"] <= rows[name]["p99_ms"]
+    for name in ('network deep_prior: engine', 'network deep_prior: pytorch', 'network deep_prior: floor',
+                 'refine or_ref x2: engine', 'refine or_ref x2: pytorch, joint by joint', 'frame deep_prior',
+                 'stage deep_prior: decode', 'stage deep_prior: detect', 'stage deep_prior: crop',
+                 'stage deep_prior: predict', 'stage deep_prior: uncrop'):
+        assert 0 < rows[name]['p50_ms'] <= rows[name]['p99_ms']
     # A frame is the sum of its stages, but for what lies between them.
-    stages = sum(rows[f"stage deep_prior: {stage}"]["min_ms"] for stage in ("decode", "detect", "crop", "predict"))
-    assert stages <= rows["frame deep_prior"]["p99_ms"]
+    stages = sum(rows[f'stage deep_prior: {stage}']['min_ms'] for stage in ('decode', 'detect', 'crop', 'predict'))
+    assert stages <= rows['frame deep_prior']['p99_ms']
     # Counted by hand: 6.4 million multiply-adds, 2.08 million weights.
-    floor = rows["network deep_prior: floor"]
-    assert floor["operations"] == pytest.approx(2 * 6.4e6, rel=0.05)
-    assert floor["weights"] == 2_076_959
+    floor = rows['network deep_prior: floor']
+    assert floor['operations'] == pytest.approx(2 * 6.4e6, rel=0.05)
+    assert floor['weights'] == 2_076_959

@@ -13,4 +13,4 @@ try:
 except ImportError as error:
     raise HandPoseError(
         'the messages of hand_pose_ros are not built for this Python: build the package with colcon build and source '
-        "its setup file, or install it again with pip where ROS is available") from error
+        'its setup file, or install it again with pip where ROS is available') from error

@@ -103,7 +103,7 @@ def get_recipe(name: str, overrides: Iterable[str] = ()) -> Recipe:
     for item in overrides:
         key, equals, text = item.partition('=')
         if not equals:
-            raise HandPoseError(f"--set {item}: write it as key=value")
+            raise HandPoseError(f'--set {item}: write it as key=value')
         recipe = _replace(recipe, key.split('.'), text, item)
     return recipe
 

@@ -52,6 +52,14 @@ def xyz(points) -> np.ndarray:
     return np.array([(p.x, p.y, p.z) for p in points])
 
 
+def listen(rig: Rig, kind: type, topic: str) -> list:
+    """The list of what will be received, connected: what is published before that is lost."""
+    rig.listen(kind, topic, RELIABLE)
+    outputs = [pub for pub in rig.node._outputs._publishers if pub.topic_name == '/' + topic.removeprefix('/')]
+    rig.until(lambda: outputs[0].get_subscription_count() == 1, topic)
+    return rig.received[kind]
+
+
 def two_hands(left: float, right: float) -> np.ndarray:
     """(H, W) metres: two hand-sized discs at these distances, 0.3 m apart."""
     v, u = np.mgrid[:HEIGHT, :WIDTH]
@@ -117,35 +125,31 @@ def test_nothing_else_is_offered_unless_asked_for(rig: Rig) -> None:
 
 def test_poses_angles_and_the_crop(rig: Rig) -> None:
     rig.start(publish_poses=True, publish_joint_states=True, side='right')
-    for kind, topic in ((PoseArray, 'hand/poses'), (JointState, 'hand/joint_states')):
-        rig.listen(kind, topic, RELIABLE)
+    all_poses, all_states = listen(rig, PoseArray, 'hand/poses'), listen(rig, JointState, 'hand/joint_states')
     publish = rig.camera(info=camera_info())
     hand = rig.answer(publish, image(depth_with_hand(), 5)).hands[0]
-    rig.until(lambda: rig.received[PoseArray] and rig.received[JointState], 'poses and angles')
-    poses, states = rig.received[PoseArray][0], rig.received[JointState][0]
+    rig.until(lambda: all_poses and all_states, 'poses and angles')
+    poses, states = all_poses[0], all_states[0]
     assert stamp_of(poses) == stamp_of(states) == 5 and poses.header.frame_id == 'camera_optical'
     np.testing.assert_array_equal(xyz(pose.position for pose in poses.poses), xyz(hand.joints))
     assert {pose.orientation.w for pose in poses.poses} == {1.0}
     assert list(states.name) == [f'r_{angle}' for angle in ANGLES]
     np.testing.assert_allclose(states.position, finger_angles(xyz(hand.joints), 'right'), atol=1e-6)
 
-    crops = rig.node._outputs._crop_pub
-    assert crops.get_subscription_count() == 0
-    rig.listen(Image, 'estimator/debug/crop', RELIABLE)
-    rig.until(lambda: crops.get_subscription_count() == 1, 'a subscriber')
+    crops = listen(rig, Image, 'estimator/debug/crop')
     hand = rig.answer(publish, image(depth_with_hand(), 6)).hands[0]
-    rig.until(lambda: rig.received[Image], 'the crop')
-    patch = rig.received[Image][0]
-    assert (patch.width, patch.height, patch.encoding, stamp_of(patch)) == (128, 128, '32FC1', 6)
+    rig.until(lambda: crops and stamp_of(crops[-1]) == 6, 'the crop')
+    patch = crops[-1]
+    assert (patch.width, patch.height, patch.encoding) == (128, 128, '32FC1')
     cube = Cube(tuple(xyz([hand.cube_center])[0].tolist()), hand.cube_size)
     intrinsics = Intrinsics(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT)
     seen = crop(decode_image(image(depth_with_hand())), cube, intrinsics)
     np.testing.assert_allclose(np.frombuffer(patch.data, np.float32).reshape(seen.shape), seen, atol=1e-5)
 
     empty = rig.answer(publish, image(np.full((HEIGHT, WIDTH), 3.0), 7))
-    rig.until(lambda: stamp_of(rig.received[PoseArray][-1]) == 7, 'no poses')
-    assert empty.hands == [] and rig.received[PoseArray][-1].poses == []
-    assert stamp_of(rig.received[JointState][-1]) == stamp_of(rig.received[Image][-1]) == 6
+    rig.until(lambda: stamp_of(all_poses[-1]) == 7, 'no poses')
+    assert empty.hands == [] and all_poses[-1].poses == []
+    assert stamp_of(all_states[-1]) == stamp_of(crops[-1]) == 6
 
 
 def test_angles_need_the_joints_of_hand21(rig: Rig, tmp_path) -> None:
@@ -174,11 +178,11 @@ def test_where_there_is_no_tf_it_is_said_and_the_rest_works(
 def test_frames_of_the_joints_on_tf(rig: Rig) -> None:
     tf2_msgs = pytest.importorskip('tf2_msgs.msg', reason='ROS from wheels has no tf2_msgs')
     rig.start(publish_tf=True, side='left')
-    rig.listen(tf2_msgs.TFMessage, '/tf', RELIABLE)
+    frames = listen(rig, tf2_msgs.TFMessage, '/tf')
     publish = rig.camera(info=camera_info())
     hand = rig.answer(publish, image(depth_with_hand(), 5)).hands[0]
-    rig.until(lambda: rig.received[tf2_msgs.TFMessage], 'frames')
-    transforms = rig.received[tf2_msgs.TFMessage][0].transforms
+    rig.until(lambda: frames, 'frames')
+    transforms = frames[0].transforms
     assert [t.child_frame_id for t in transforms] == [f'l_{name}' for name in HAND21.joint_names]
     assert {(stamp_of(t), t.header.frame_id) for t in transforms} == {(5, 'camera_optical')}
     np.testing.assert_array_equal(xyz(t.transform.translation for t in transforms), xyz(hand.joints))
@@ -203,14 +207,14 @@ def test_joints_in_the_target_frame(rig: Rig, monkeypatch: pytest.MonkeyPatch) -
     stand_in.TransformListener = lambda buffer, node: SimpleNamespace(unregister=lambda: asked.append(('closed',)))
     monkeypatch.setitem(sys.modules, 'tf2_ros', stand_in)
     rig.start(target_frame='base_link', tracking=False, publish_poses=True)
-    rig.listen(PoseArray, 'hand/poses', RELIABLE)
+    poses = listen(rig, PoseArray, 'hand/poses')
     publish = rig.camera(RELIABLE, info=camera_info())
     there = rig.answer(publish, image(depth_with_hand(), 7))
     assert asked == [('base_link', 'camera_optical', 7_000_000)] and there.header.frame_id == 'base_link'
     center = xyz([there.hands[0].cube_center])[0]
     assert center == pytest.approx((0.6, 0, 2), abs=0.15)
-    rig.until(lambda: rig.received[PoseArray], 'poses')
-    assert rig.received[PoseArray][0].header.frame_id == 'base_link'
+    rig.until(lambda: poses, 'poses')
+    assert poses[0].header.frame_id == 'base_link'
     publish(image(depth_with_hand(), 8, frame='lost'))
     rig.until_said('lost', 'base_link', 'two unconnected trees')
     assert stamp_of(rig.answer(publish, image(depth_with_hand(), 9))) == 9

@@ -22,7 +22,7 @@ from hand_pose_ros.errors import InputError
 from hand_pose_ros.geometry import Cube, Intrinsics, crop
 from hand_pose_ros.models.checkpoints import load_checkpoint
 from hand_pose_ros.runtime import Engine, make_engine
-from hand_pose_ros.scoring import explain
+from hand_pose_ros.scoring import explain, learned
 from hand_pose_ros.skeleton import Skeleton, get_skeleton
 from hand_pose_ros.smoothing import OneEuroFilter
 
@@ -226,10 +226,10 @@ class HandPoseEstimator:
                ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
         """Confidence of the joints (N, J), score (N,), and how far each looks like a right hand (N,), of N patches.
 
-        A network that has learned to judge itself is believed; of another, the joints are held against the depth.
+        See `scoring`.
         """
         if 'confidence' in answer:
-            return _sigmoid(answer['confidence']), _sigmoid(answer['hand']), answer['side']
+            return *learned(answer['confidence'], answer['hand']), answer['side']
         judged = [explain(patch, joints, cube.side, self.skeleton)
                   for patch, joints in zip(patches, answer['joints'], strict=True)]
         score = np.array([score for _, score in judged], np.float32)
@@ -253,10 +253,6 @@ class HandPoseEstimator:
         start = time.perf_counter()
         yield
         self.timings[stage] += time.perf_counter() - start
-
-
-def _sigmoid(logits: NDArray[np.float32]) -> NDArray[np.float32]:
-    return 0.5 * (1 + np.tanh(0.5 * logits))
 
 
 def _overlaps(cube: Cube, hands: list[HandEstimate]) -> bool:

@@ -1,7 +1,7 @@
-"""How well an estimated skeleton explains the depth it came from.
+"""Confidence of joints and score of hands.
 
-The paper's networks answer with joints and nothing else, whatever they are shown. This geometric check gives them a
-confidence per joint and a score per hand; networks that have learned to judge themselves do not need it.
+A network that has learned to judge itself is believed (`learned`). The paper's networks answer with joints and nothing
+else, whatever they are shown; of these, the joints are held against the depth they came from (`explain`).
 """
 
 from __future__ import annotations
@@ -20,6 +20,17 @@ HIDDEN_CONFIDENCE = 0.5
 """What a joint is given that nothing speaks for or against."""
 REACH_M = 0.022
 """Surface further than this from every bone is not explained by the skeleton."""
+
+
+def learned(confidence: NDArray[np.float32], hand: NDArray[np.float32],
+            ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Confidence of each joint (N, J) and score (N,) from the logits that a network gives of N patches.
+
+    The score is the share of joints that can be expected to be right: the probability that this is a hand, times the
+    mean confidence of its joints. Either alone lets things pass that the other knows to be wrong.
+    """
+    confidence, hand = (0.5 * (1 + np.tanh(0.5 * logits)) for logits in (confidence, hand))
+    return confidence, hand * confidence.mean(axis=1)
 
 
 def explain(patch: NDArray[np.float32], joints: NDArray[np.floating], side: float,

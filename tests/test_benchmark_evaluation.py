@@ -31,4 +31,5 @@ def test_calibration_counts_what_was_right():
     assert low == {'confidence': [0.0, 0.1], 'joints': 1, 'right': 0.0}
     assert high == {'confidence': [0.9, 1.0], 'joints': 3, 'right': pytest.approx(2 / 3, abs=1e-3)}
     assert known['side_found'] == 0.5
-    assert known['hands_with_score_above_half'] == 0.5 and known['no_hands_with_score_above_half'] == 1.0
+    # Of the hands one is sure of half of its joints: 0.73 * 0.5 = 0.37; the other is likely none: 0.27 * 0.98.
+    assert known['hands_reported'] == 0.5 and known['no_hands_reported'] == 1.0

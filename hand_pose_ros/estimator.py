@@ -105,7 +105,7 @@ class HandPoseEstimator:
     cube_side: float = 0.30
     side: Literal['auto', 'left', 'right'] = 'auto'
     max_hands: int = 1
-    min_score: float = 0.3
+    min_score: float = 0.4
     near: float = 0.1
     far: float = 1.5
     tracking: bool = True

@@ -25,11 +25,11 @@ def test_a_network_is_scored_on_the_frames_with_a_hand(tmp_path):
 def test_calibration_counts_what_was_right():
     confidence = np.array([[4.0, -4.0], [4.0, 4.0], [9.0, 9.0]], np.float32)
     right = np.array([[True, False], [True, False], [True, True]])
-    known = _self_knowledge(confidence, right, np.array([1.0, -1.0, 2.0], np.float32), np.array([True, False, True]),
+    known = _self_knowledge(confidence, right, np.array([3.0, -1.0, 2.0], np.float32), np.array([True, False, True]),
                             np.array([True, True, False]))
     low, high = known['calibration_20_mm']
     assert low == {'confidence': [0.0, 0.1], 'joints': 1, 'right': 0.0}
     assert high == {'confidence': [0.9, 1.0], 'joints': 3, 'right': pytest.approx(2 / 3, abs=1e-3)}
     assert known['side_found'] == 0.5
-    # Of the hands one is sure of half of its joints: 0.73 * 0.5 = 0.37; the other is likely none: 0.27 * 0.98.
+    # Of the hands one is sure of half of its joints, 0.95 * 0.5; the other is likely none, 0.27 * 0.98.
     assert known['hands_reported'] == 0.5 and known['no_hands_reported'] == 1.0

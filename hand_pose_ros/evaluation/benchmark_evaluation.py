@@ -19,7 +19,7 @@ from hand_pose_ros.synthetic import benchmark
 
 NEAR_MM = 20.0
 """A joint is right within this distance: what a confidence is the probability of."""
-MIN_SCORE = 0.3
+MIN_SCORE = 0.4
 """What the estimator reports by default."""
 BINS = np.linspace(0, 1, 11)
 

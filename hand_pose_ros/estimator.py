@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from hand_pose_ros.detection import Region, candidates, holds_a_hand
 from hand_pose_ros.errors import InputError
-from hand_pose_ros.geometry import Cube, Intrinsics, crop
+from hand_pose_ros.geometry import PATCH_SIZE, Cube, Intrinsics, crop
 from hand_pose_ros.models.checkpoints import load_checkpoint
 from hand_pose_ros.runtime import Engine, make_engine
 from hand_pose_ros.scoring import explain, learned
@@ -137,6 +137,11 @@ class HandPoseEstimator:
         engine = make_engine(checkpoint.network, device=device, num_threads=num_threads, refiner=checkpoint.refiner)
         options.setdefault('cube_side', checkpoint.metadata['cube_side'])
         return cls(engine, get_skeleton(checkpoint.metadata['skeleton']), metadata=checkpoint.metadata, **options)
+
+    def warm_up(self) -> None:
+        """Let the engine prepare itself, so that the first image is answered as fast as the others."""
+        for patches in (1, 2):  # of one side, and of both
+            self.engine.run_full(np.ones((patches, 1, PATCH_SIZE, PATCH_SIZE), np.float32))
 
     def reset(self) -> None:
         """Forget the hands of the last image."""

@@ -100,13 +100,15 @@ class Params:
             raise HandPoseError('parameters intrinsics.fx and intrinsics.fy go together: set both, or neither')
 
     def make_estimator(self) -> HandPoseEstimator:
-        """Load the network.
+        """Load the network, ready to answer.
 
         Raises:
             HandPoseError: there are no such weights, or no such device.
         """
-        return HandPoseEstimator.from_pretrained(
+        estimator = HandPoseEstimator.from_pretrained(
             self.model or None, device=self.device, num_threads=self.num_threads or None)
+        estimator.warm_up()
+        return estimator
 
     def apply(self, estimator: HandPoseEstimator) -> None:
         """Set what may change between two images."""

@@ -38,6 +38,9 @@ FRAME_S = 1 / 30
 """Time between images for smoothing, where the caller does not say."""
 SIDE_MEMORY = 0.9
 """What a hand has shown of its side fades by this factor each image: about ten images decide."""
+SETTLED = 5.0
+"""A side that has shown itself by more than this (logits) is not doubted until that has faded: about every seventh
+image. The scores of networks that do not judge sides never get there."""
 
 
 @dataclass(frozen=True)
@@ -213,19 +216,24 @@ class HandPoseEstimator:
     def _predict(self, depth: NDArray[np.float32], intrinsics: Intrinsics, cube: Cube, track: _Track) -> _Reading:
         with self._timed('crop'):
             patch = crop(depth, cube, intrinsics)
-            # The network knows right hands. A left hand is shown to it in the mirror; of an unknown one, both.
-            as_right, as_left = self.side != 'left', self.side != 'right'
-            patches = np.stack([patch] * as_right + [patch[..., ::-1]] * as_left)
+            mirrored = self._mirrorings(track)
+            patches = np.stack([patch[..., ::-1] if mirror else patch for mirror in mirrored])
         with self._timed('predict'):
             answer = self.engine.run_full(patches)
         with self._timed('uncrop'):
             confidence, score, right = self._judge(patches, answer, cube)
             rightness = float(right[0] - right[-1])
-            shown = 1 if as_right and as_left and track.rightness + rightness < 0 else 0
+            shown = int(len(mirrored) == 2 and track.rightness + rightness < 0)
             coordinates = answer['joints'][shown].astype(np.float64)
-            if shown == 1 or not as_right:
+            if mirrored[shown]:
                 coordinates[:, 0] *= -1
             return _Reading(cube, cube.from_cube(coordinates), confidence[shown], float(score[shown]), rightness)
+
+    def _mirrorings(self, track: _Track) -> tuple[bool, ...]:
+        """The network knows right hands: a left one is shown to it in the mirror, and of an unknown one, both."""
+        if self.side != 'auto':
+            return (self.side == 'left',)
+        return (track.rightness < 0,) if abs(track.rightness) > SETTLED else (False, True)
 
     def _judge(self, patches: NDArray[np.float32], answer: dict[str, NDArray[np.float32]], cube: Cube,
                ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:

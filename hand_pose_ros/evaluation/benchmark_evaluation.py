@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hand_pose_ros.datasets import joints_in_metres
+from hand_pose_ros.estimator import HandPoseEstimator
 from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.models.checkpoints import DEFAULT, load_checkpoint
@@ -19,8 +20,6 @@ from hand_pose_ros.synthetic import benchmark
 
 NEAR_MM = 20.0
 """A joint is right within this distance: what a confidence is the probability of."""
-MIN_SCORE = 0.4
-"""What the estimator reports by default."""
 BINS = np.linspace(0, 1, 11)
 
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
@@ -77,7 +76,7 @@ def _self_knowledge(confidence: NDArray[np.float32], right: NDArray[np.bool_], h
         return round(float(of.mean()), 4) if of.size else None
 
     return {'calibration_20_mm': calibration, 'side_found': share(side_found[present]),
-            'hands_reported': share(score[present] >= MIN_SCORE),
-            'no_hands_reported': share(score[~present] >= MIN_SCORE)}
+            'hands_reported': share(score[present] >= HandPoseEstimator.min_score),
+            'no_hands_reported': share(score[~present] >= HandPoseEstimator.min_score)}
 
 

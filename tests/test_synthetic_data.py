@@ -22,13 +22,7 @@ from hand_pose_ros.synthetic.stages import Ingredients
 CHUNK = 24  # smaller than by default: quick
 
 
-@pytest.fixture(scope='module', autouse=True)
-def one_thread():
-    """Small batches gain nothing from threads, and lose much on a machine that runs other tests beside."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures('one_thread')
 
 
 @pytest.fixture(scope='module')

@@ -15,13 +15,7 @@ from hand_pose_ros.synthetic.renderer import View, depth_of, rasterise
 SIZE = 96
 
 
-@pytest.fixture(scope='module', autouse=True)
-def one_thread():
-    """Small images gain nothing from threads, and lose much on a machine that runs other tests beside."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures('one_thread')
 
 
 def view(batch: int = 1, focal: float = 200.0, height: int = SIZE, width: int = SIZE + 8) -> View:

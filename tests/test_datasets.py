@@ -226,6 +226,19 @@ def test_the_crop_is_centred_on_what_is_there():
     assert center_of_mass_cube(np.zeros((240, 320), np.float32), nothing, camera) == nothing
 
 
+def test_training_hands_can_do_without_an_ingredient():
+    numbers = torch.arange(8)
+    complete = open_dataset('synthetic', 'train')
+    noiseless, bare = (open_dataset(f'synthetic:without-{name}', 'train') for name in ('noise', 'everything'))
+    assert len({complete.fingerprint, noiseless.fingerprint, bare.fingerprint}) == 3  # nor do they share shards
+    a, b, c = (hands.batch(numbers) for hands in (complete, noiseless, bare))
+    assert torch.equal(a['joints'], b['joints']) and not torch.equal(a['patch'], b['patch'])
+    assert not torch.equal(a['joints'], c['joints'])
+    held_out = open_dataset('synthetic:without-everything', 'val')
+    assert torch.equal(held_out.batch(numbers)['patch'], open_dataset('synthetic', 'val').batch(numbers)['patch'])
+    assert held_out.fingerprint == open_dataset('synthetic', 'val').fingerprint
+
+
 def test_synthetic_hands_are_right_hands_to_the_network():
     from hand_pose_ros.synthetic.generator import SyntheticHands
     scene = SyntheticHands('val').batch(torch.arange(16))
@@ -241,7 +254,8 @@ def test_synthetic_hands_are_right_hands_to_the_network():
 @pytest.mark.parametrize(('name', 'split', 'message'), [
     ('nyuu', 'train', "unknown dataset 'nyuu'"), ('nyu', 'train', r'joint_data\.mat is missing'),
     ('msra', 'train', 'P2 with its gestures is missing'), ('bags', 'train', 'holds no bags'),
-    ('synthetic', 'tset', "unknown split 'tset'"), ('icvl', 'tset', "unknown split 'tset'")])
+    ('synthetic', 'tset', "unknown split 'tset'"), ('synthetic:without-skin', 'train', 'synthetic:without-NAME'),
+    ('icvl', 'tset', "unknown split 'tset'")])
 def test_what_is_not_there_is_one_sentence(tmp_path, name, split, message):
     with pytest.raises(DatasetError, match=message):
         open_dataset(name, split, tmp_path)

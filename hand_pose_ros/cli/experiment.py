@@ -13,6 +13,7 @@ EPILOG = """experiments:
   joints        mean error of each joint
   runtime       milliseconds per hand, beside the paper's
   qualitative   estimates and truth on depth and on the point cloud from the side
+  ingredients   (ours) what each ingredient of the synthetic hands is worth: trained without it, tested with all
 
 Each writes NAME.json, NAME.md, NAME.png and NAME.svg. Networks are trained with equal budgets into OUT/runs and shared
 by all experiments in OUT; an interrupted training goes on.
@@ -28,8 +29,8 @@ def add_parser(subparsers: Any) -> None:
 
     parser = subparsers.add_parser('experiment', help='repeat an experiment of the paper', epilog=EPILOG,
                                    formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('name', choices=['networks', 'bottleneck', 'refinement', 'joints', 'runtime', 'qualitative'],
-                        metavar='NAME', help='see below')
+    parser.add_argument('name', metavar='NAME', choices=['networks', 'bottleneck', 'refinement', 'joints', 'runtime', 'qualitative',
+                                                 'ingredients'], help='see below')
     parser.add_argument('--out', type=Path, required=True, metavar='OUT', help='folder of results and trained networks')
     parser.add_argument('--recipe', default='paper', help='what all networks are trained by (default: %(default)s)')
     add_machine_arguments(parser)

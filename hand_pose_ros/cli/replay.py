@@ -33,8 +33,8 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('--clock', action='store_true', help='publish /clock, for nodes with use_sim_time')
     parser.add_argument('--qos', default='recorded', choices=('recorded', 'reliable', 'best_effort'),
                         help='reliability of the publishers (recorded; for ROS 1 bags that is reliable)')
-    parser.add_argument('--wait', type=float, default=2.0, metavar='S',
-                        help='wait up to S seconds for a subscriber before the first message (2)')
+    parser.add_argument('--wait', type=float, default=4.0, metavar='S',
+                        help='seconds for subscribers to find the topics before the first message; they may need 3 (4)')
     parser.add_argument('--ros-args', nargs=argparse.REMAINDER, default=[], metavar='...',
                         help='remappings (-r from:=to) and so on, as with ros2 run')
     parser.set_defaults(parser=parser)

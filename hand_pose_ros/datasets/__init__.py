@@ -15,7 +15,8 @@ def open_dataset(name: str, split: str, root: Path | None = None, device: str = 
     """A dataset by name.
 
     Args:
-        name: one of `DATASETS`; 'msra:P3' leaves out the subject P3.
+        name: one of `DATASETS`; 'msra:P3' leaves out the subject P3; 'synthetic:without-surface' trains on hands that
+            lack this ingredient (see `hand_pose_ros.synthetic.stages.Ingredients`), or with 'everything' all of them.
         split: 'train', 'val' or 'test'; nyu and icvl also have 'test_1' and 'test_2'.
         root: folder of a recorded dataset.
         device: where synthetic hands are rendered.
@@ -24,11 +25,11 @@ def open_dataset(name: str, split: str, root: Path | None = None, device: str = 
         DatasetError: no such dataset or split, or its files are missing.
     """
     kind, _, variant = name.partition(':')
-    if kind not in DATASETS or (variant and kind != 'msra'):
+    if kind not in DATASETS or (variant and kind not in ('msra', 'synthetic')):
         raise DatasetError(f"unknown dataset '{name}': choose one of {', '.join(DATASETS)}, or msra:P1 to msra:P8")
     if kind == 'synthetic':
         from hand_pose_ros.datasets.synthetic import Synthetic
-        return Synthetic(split, device)
+        return Synthetic(split, device, variant)
     if root is None:
         raise DatasetError(f'{name} is read from disk: give its folder with --set root=FOLDER')
     if kind == 'nyu':

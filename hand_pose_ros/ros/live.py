@@ -81,7 +81,7 @@ def play_through_node(bag: DepthBag, camera_info_topic: str | None = None,
             _wait_until(lambda: bool(listener.skeleton), process, START_TIMEOUT_S)
             replay = Replay(bag, topics={bag.depth_topic, *infos}, reliability='reliable')
             try:
-                replay.wait_for_subscribers(START_TIMEOUT_S)
+                replay.wait_for_subscribers(START_TIMEOUT_S, 2 + len(infos))  # node and listener; camera_info: node
                 answered = lambda: len(listener.answers) >= replay.published[bag.depth_topic]  # noqa: E731
                 replay.play(ready=answered if patient else None)
                 listener.wait_until_quiet()  # the last image goes with its publisher, if it is still on the way

@@ -74,18 +74,19 @@ class Replay:
             raise InputError(f'{bag.path}: there is nothing to publish: no topic has messages of an installed type')
         self.node.create_service(SetBool, '~/pause', self._on_pause)
 
-    def wait_for_subscribers(self, timeout_s: float) -> None:
-        """Wait until somebody listens and nobody new has come for a moment, but no longer than the timeout."""
-        start = changed = time.monotonic()
-        before: list[int] = []
-        while time.monotonic() - start < timeout_s:
-            now = [output.get_subscription_count() for output in self._outputs.values()]
-            if now != before:
-                before, changed = now, time.monotonic()
-            # The other side needs a moment, too, before it hears what is best effort.
-            if any(now) and time.monotonic() - changed > SETTLE_S:
-                return
-            self._executor.spin_once(timeout_sec=0.05)
+    def wait_for_subscribers(self, timeout_s: float, number: int | None = None) -> None:
+        """Give subscribers time to find the topics: what is published earlier never reaches them.
+
+        Args:
+            timeout_s: DDS participants that miss each other at first announce themselves again every 3 s.
+            number: of subscriptions to all topics together; as soon as there are so many, the waiting ends.
+        """
+        end = time.monotonic() + timeout_s
+        while (left := end - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=min(left, 0.05))
+            if number is not None and sum(o.get_subscription_count() for o in self._outputs.values()) >= number:
+                # The other side needs a moment, too, before it hears what is best effort.
+                number, end = None, min(end, time.monotonic() + SETTLE_S)
 
     def play(self, start_s: float = 0.0, ready: Callable[[], bool] | None = None) -> None:
         """Publish the bag once, from `start_s` seconds after its beginning.

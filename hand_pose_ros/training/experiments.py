@@ -199,5 +199,19 @@ def runtime(lab: Laboratory) -> str:
     return lab.write('runtime', text, {'rows': rows, 'paper_ms': PAPER_MS}, figures.runtime(rows, PAPER_MS))
 
 
+def ingredients(lab: Laboratory) -> str:
+    """Deep-Prior trained on synthetic hands that lack one ingredient, or all, and tested on complete ones."""
+    from hand_pose_ros.datasets.synthetic import INGREDIENTS
+    if lab.recipe.dataset != 'synthetic':
+        raise HandPoseError(f'--set dataset={lab.recipe.dataset}: only synthetic hands have ingredients to leave out')
+    results = [lab.result('complete', lab.network('deep', 30))]
+    for name in (*INGREDIENTS, 'everything'):
+        checkpoint = lab.train(f'deep-30-without-{name}', network='deep', options={'bottleneck': 30},
+                               dataset=f'synthetic:without-{name}')
+        results.append(lab.result(f'without {name}', checkpoint))
+    return lab.write_results('ingredients', results, plots.curves(results))
+
+
 EXPERIMENTS: dict[str, Callable[[Laboratory], str]] = {
-    experiment.__name__: experiment for experiment in (networks, bottleneck, refinement, joints, runtime, qualitative)}
+    experiment.__name__: experiment for experiment in (
+        networks, bottleneck, refinement, joints, runtime, qualitative, ingredients)}

@@ -43,7 +43,7 @@ def decode_image(msg: Any, depth_scale: float = 0.001, *, source: str = '') -> N
     with naming(source):
         height, width, step = int(msg.height), int(msg.width), int(msg.step)
         if msg.encoding not in DEPTH_ENCODINGS:
-            raise InputError(f"the encoding '{msg.encoding}' is not depth: choose a topic with one of "
+            raise InputError(f'the encoding {msg.encoding!r:.80} is not depth: choose a topic with one of '
                              f'{", ".join(DEPTH_ENCODINGS)}')
         if height <= 0 or width <= 0:
             raise InputError(f'the image is empty ({width}x{height} pixels): does the camera stream depth?')
@@ -76,14 +76,14 @@ def decode_compressed(msg: Any, depth_scale: float = 0.001, *, source: str = '')
         words = msg.format.replace(';', ' ').split()
         encoding = words[0] if words else ''
         if encoding not in DEPTH_ENCODINGS:
-            raise InputError(f"the format '{msg.format}' is not compressed depth: choose a topic whose format "
+            raise InputError(f'the format {msg.format!r:.80} is not compressed depth: choose a topic whose format '
                              f"begins with {', '.join(DEPTH_ENCODINGS)} (such as '16UC1; compressedDepth png')")
         data = memoryview(msg.data).cast('B')
         plain = bytes(data[:8]) == _PNG_SIGNATURE  # the `compressed` transport writes no header
         if DEPTH_ENCODINGS[encoding].kind == 'u':
             return to_metres(_decode_units(data[0 if plain else _HEADER.size:], words), depth_scale)
         if plain or len(data) < _HEADER.size:
-            raise InputError(f"the header of the format '{msg.format}' is missing: publish 32FC1 depth with "
+            raise InputError(f'the header of the format {msg.format!r:.80} is missing: publish 32FC1 depth with '
                              'the transport compressedDepth, or as a raw image')
         _, a, b = _HEADER.unpack_from(data)
         return _from_inverse_depth(_decode_units(data[_HEADER.size:], words), a, b)

@@ -5,8 +5,6 @@ from array import array
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
@@ -18,7 +16,7 @@ from visualization_msgs.msg import Marker
 
 from hand_pose_ros import markers as markers_module
 from hand_pose_ros.drawing import FINGER_COLORS
-from hand_pose_ros.errors import HandPoseError, InputError
+from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.estimator import HandEstimate
 from hand_pose_ros.geometry import Cube, Intrinsics
 from hand_pose_ros.markers import HandMarkers
@@ -116,25 +114,6 @@ def test_binning_and_region_of_interest() -> None:
     camera.update(info(binning_x=2, binning_y=2,
                        roi=RegionOfInterest(x_offset=100, y_offset=40, width=320, height=240)))
     assert camera.intrinsics(160, 120, Params()) == Intrinsics(250, 255, 110, 100, 160, 120)
-
-
-numbers = st.floats(width=64)
-
-
-@settings(max_examples=500, deadline=None)
-@given(k=st.lists(numbers, min_size=9, max_size=9), p=st.lists(numbers, min_size=12, max_size=12),
-       size=st.tuples(*[st.integers(0, 2**32 - 1)] * 2), binning=st.tuples(*[st.integers(0, 2**32 - 1)] * 2),
-       roi=st.tuples(*[st.integers(0, 2**32 - 1)] * 4))
-def test_any_camera_info_is_usable_or_refused_with_its_topic(k, p, size, binning, roi) -> None:
-    camera = Camera('/depth/camera_info')
-    camera.update(info(k=k, p=p, width=size[0], height=size[1], binning_x=binning[0], binning_y=binning[1],
-                       roi=RegionOfInterest(x_offset=roi[0], y_offset=roi[1], width=roi[2], height=roi[3])))
-    try:
-        intrinsics = camera.intrinsics(640, 480, Params(camera_info_timeout=0.0))
-    except InputError as error:
-        assert '/depth/camera_info' in str(error)
-    else:
-        assert (intrinsics.width, intrinsics.height) == (640, 480) and intrinsics.fx > 0 and intrinsics.fy > 0
 
 
 def test_depth_that_cannot_hold_a_hand_is_explained() -> None:

@@ -81,6 +81,7 @@ def test_decoding_leaves_the_message_as_it_was():
 @pytest.mark.parametrize(('change', 'says'), [
     ({'encoding': 'rgb8'}, "'rgb8'.*16UC1, mono16, 32FC1"),
     ({'encoding': ''}, "''.*16UC1"),
+    ({'encoding': 'two\nlines' * 99}, r"'two\\nlines[^']*is not depth"),
     ({'width': 0}, 'empty'),
     ({'height': 0}, 'empty'),
     ({'step': 129}, 'step is 129 .*130'),
@@ -193,47 +194,6 @@ def test_rvl_of_a_known_stream():
 @given(UNITS)
 def test_rvl_is_lossless(units):
     np.testing.assert_array_equal(decode_rvl(encode_rvl(units)), units)
-
-
-@settings(deadline=None)
-@given(UNITS, st.data())
-def test_corrupt_rvl_gives_an_image_of_its_size_or_an_input_error(units, data):
-    stream = bytearray(encode_rvl(units))
-    for _ in range(data.draw(st.integers(1, 4))):
-        stream[data.draw(st.integers(0, len(stream) - 1))] ^= data.draw(st.integers(1, 255))
-    try:
-        decoded = decode_rvl(bytes(stream))
-    except InputError:
-        return
-    assert decoded.shape[::-1] == struct.unpack_from('<II', stream)
-
-
-@settings(deadline=None, max_examples=300)
-@given(height=st.integers(0, 2**32 - 1) | st.integers(0, 6), width=st.integers(0, 2**32 - 1) | st.integers(0, 6),
-       step=st.integers(0, 2**32 - 1) | st.integers(0, 30),
-       encoding=st.sampled_from(['16UC1', 'mono16', '32FC1', 'bgr8', '']), is_bigendian=st.integers(0, 255),
-       data=st.binary(max_size=200))
-def test_any_image_gives_clean_depth_or_an_input_error(**fields):
-    try:
-        depth = decode_image(SimpleNamespace(**fields))
-    except InputError as error:
-        assert str(error) and '\n' not in str(error)
-        return
-    assert depth.shape == (fields['height'], fields['width']) and depth.dtype == np.float32
-    assert np.isfinite(depth).all() and (depth >= 0).all()
-
-
-@settings(deadline=None, max_examples=300)
-@given(form=st.sampled_from(['16UC1; compressedDepth png', '16UC1; compressedDepth rvl', '32FC1; compressedDepth rvl'])
-       | st.text(max_size=20), data=st.binary(max_size=120) | st.binary(max_size=60).map(
-           lambda tail: b'\0' * 12 + struct.pack('<II', 8, 8) + tail))
-def test_any_compressed_image_gives_clean_depth_or_an_input_error(form, data):
-    try:
-        depth = decode_compressed(SimpleNamespace(format=form, data=data))
-    except InputError as error:
-        assert str(error)
-        return
-    assert depth.ndim == 2 and np.isfinite(depth).all() and (depth >= 0).all()
 
 
 def test_what_does_not_fit_into_sixteen_bits_is_no_reading():

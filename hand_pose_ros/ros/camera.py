@@ -69,8 +69,8 @@ class Camera:
         info = self._info
         if params.intrinsics_fx > 0 or info is None or info.header.frame_id in ('', frame_id):
             return ''
-        return (f"its frame_id is '{frame_id}' but that of {self.topic} is '{info.header.frame_id}': if they are "
-                'different cameras, the joints are wrong; remap depth/camera_info to the one of the depth image')
+        return (f'its frame_id is {frame_id!r:.80} but that of {self.topic} is {info.header.frame_id!r:.80}: if they '
+                'are different cameras, the joints are wrong; remap depth/camera_info to the one of the depth image')
 
     def _fits(self, width: int, height: int) -> bool:
         if self._info is None:

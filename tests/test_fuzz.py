@@ -1,0 +1,259 @@
+"""Whatever arrives on a topic is answered or refused in one sentence, with real messages whose fields are checked.
+
+    pytest tests/test_fuzz.py                                          # a glance, in seconds
+    HAND_POSE_FUZZ=20000 pytest tests/test_fuzz.py --timeout 0 --hypothesis-show-statistics    # 20,000 cases per test
+
+Half of the cases are sound messages in which some fields or bytes are replaced, for pure noise is refused at the door.
+"""
+
+import os
+import re
+import resource
+import struct
+from array import array
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, event, given, settings
+from hypothesis import strategies as st
+
+rclpy = pytest.importorskip('rclpy', reason='needs ROS 2')
+pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
+
+from rclpy.parameter import Parameter  # noqa: E402
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, RegionOfInterest  # noqa: E402
+from visualization_msgs.msg import MarkerArray  # noqa: E402
+
+from hand_pose_ros.depth import (  # noqa: E402
+    DEPTH_ENCODINGS,
+    decode_compressed,
+    decode_image,
+    encode_png,
+    encode_rvl,
+)
+from hand_pose_ros.errors import InputError  # noqa: E402
+from hand_pose_ros.models import build  # noqa: E402
+from hand_pose_ros.models.checkpoints import save_checkpoint  # noqa: E402
+from hand_pose_ros.msg import HandJointsArray  # noqa: E402
+from hand_pose_ros.ros.camera import Camera  # noqa: E402
+from hand_pose_ros.ros.node import EstimatorNode  # noqa: E402
+from hand_pose_ros.ros.params import Params  # noqa: E402
+
+FUZZ = settings(max_examples=int(os.environ.get('HAND_POSE_FUZZ', '200')), deadline=None,
+                suppress_health_check=list(HealthCheck))
+TOPIC, INFO_TOPIC = '/depth/image_rect', '/depth/camera_info'
+ALLOCATION = 512 << 20
+"""Bytes that decoding may take: many for the largest image, far from those that a corrupt size can claim."""
+
+UINT32 = st.integers(0, 40) | st.integers(0, 2**32 - 1)
+FLOATS = st.floats() | st.sampled_from([0.0, 1.0, 1e-300, 1e-30, 1e30, 1e300])
+
+
+def harm(draw: st.DrawFn, message: Any, fields: dict[str, st.SearchStrategy]) -> Any:
+    """Replace some fields, or none, by anything that fits into them."""
+    for name in draw(st.just([]) | st.lists(st.sampled_from(sorted(fields)), max_size=3)):
+        setattr(message, name, draw(fields[name]))
+    return message
+
+
+@st.composite
+def headers(draw: st.DrawFn, message: Any) -> Any:
+    message.header.stamp.sec = draw(st.integers(-2**31, 2**31 - 1) | st.integers(0, 3))
+    message.header.stamp.nanosec = draw(UINT32)
+    message.header.frame_id = draw(st.sampled_from(['camera', '']) | st.text(max_size=10))
+    return message
+
+
+def scene(draw: st.DrawFn) -> np.ndarray:
+    """(H, W) uint16 millimetres: a hand-sized disc, or any pattern."""
+    height, width = draw(st.integers(1, 40)), draw(st.integers(1, 40))
+    if draw(st.booleans()):
+        v, u = np.mgrid[:height, :width]
+        z, noise = draw(st.sampled_from([500, 600]) | st.integers(1, 3000)), draw(st.integers(0, 300))
+        disc = np.hypot(u - width / 2, v - height / 2) < draw(st.integers(3, 12))
+        rng = np.random.default_rng(draw(st.integers(0, 99)))
+        return (np.where(disc, z, 3000) + rng.integers(0, noise + 1, disc.shape)).astype(np.uint16)
+    pattern = draw(st.lists(st.integers(0, 0xFFFF), min_size=1, max_size=30))
+    return np.resize(np.array(pattern, np.uint16), (height, width))
+
+
+@st.composite
+def images(draw: st.DrawFn) -> Image:
+    pixels, encoding = scene(draw), draw(st.sampled_from([*DEPTH_ENCODINGS]))
+    if encoding == '32FC1':
+        pixels = (pixels * np.float32(0.001)).astype(np.float32)
+        for value in draw(st.lists(st.floats(width=32), max_size=3)):
+            pixels.flat[draw(st.integers(0, pixels.size - 1))] = value
+    big = draw(st.integers(0, 255))
+    rows = pixels.astype(pixels.dtype.newbyteorder('>' if big else '<')).view(np.uint8)
+    rows = np.pad(rows, ((0, 0), (0, draw(st.sampled_from([0, 0, 1, 3])))), constant_values=0xAB)
+    message = Image(height=pixels.shape[0], width=pixels.shape[1], step=rows.shape[1], encoding=encoding,
+                    is_bigendian=big, data=array('B', rows.tobytes()))
+    return harm(draw, draw(headers(message)), {
+        'height': UINT32, 'width': UINT32, 'step': UINT32, 'is_bigendian': st.integers(0, 255),
+        'encoding': st.sampled_from([*DEPTH_ENCODINGS, '', 'rgb8', '8UC1', '16SC1', '64FC1', ' 16UC1']) | st.text(),
+        'data': st.binary(max_size=500).map(lambda data: array('B', data))})
+
+
+@st.composite
+def compressed_images(draw: st.DrawFn) -> CompressedImage:
+    units, codec = scene(draw), draw(st.sampled_from(['png', 'rvl']))
+    payload = bytearray(encode_png(units) if codec == 'png' else encode_rvl(units))
+    for _ in range(draw(st.sampled_from([0, 0, 0, 1, 2]))):  # damage, from single bits to sizes that claim memory
+        at, change = draw(st.integers(0, len(payload) - 1)), draw(st.binary(min_size=1, max_size=8))
+        payload[at:at + len(change)] = change
+    if draw(st.integers(0, 5)) == 0:
+        payload = payload[:draw(st.integers(0, len(payload)))] + draw(st.binary(max_size=20))
+    sound = struct.pack('<iff', 0, 10100.0, -1009.0)
+    header = draw(st.sampled_from([b'', sound, sound, sound])
+                  | st.tuples(*[st.floats(width=32)] * 2).map(lambda values: struct.pack('<iff', 0, *values)))
+    formats = [f'{encoding}; {transport}' for encoding in DEPTH_ENCODINGS for transport in (
+        f'compressedDepth {codec}', 'compressedDepth', 'compressedDepth ', f'{codec} compressed ', '')]
+    message = CompressedImage(format=draw(st.just(formats[0]) | st.sampled_from(formats)),
+                              data=array('B', header + payload))
+    return harm(draw, draw(headers(message)), {
+        'format': st.text() | st.sampled_from(['', 'jpeg', ';', '16UC1', 'rgb8; jpeg compressed bgr8', *formats]),
+        'data': st.binary(max_size=200).map(lambda data: array('B', data))})
+
+
+@st.composite
+def camera_infos(draw: st.DrawFn, height: int, width: int) -> CameraInfo:
+    """For an image of this size, more or less."""
+    k, focal = [0.0] * 9, draw(st.sampled_from([50.0, 80.0]) | st.floats(5, 500))
+    k[0], k[2], k[4], k[5], k[8] = focal, width / 2, focal, height / 2, 1.0
+    binning = draw(st.integers(0, 3))
+    scale = max(binning, 1)
+    message = CameraInfo(height=height * scale, width=width * scale, k=k, binning_x=binning, binning_y=binning)
+    if draw(st.booleans()):
+        message.p = [*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0]
+    return harm(draw, draw(headers(message)), {
+        'height': UINT32, 'width': UINT32, 'binning_x': UINT32, 'binning_y': UINT32,
+        'k': st.lists(FLOATS, min_size=9, max_size=9), 'p': st.lists(FLOATS, min_size=12, max_size=12),
+        'd': st.lists(FLOATS, max_size=8), 'distortion_model': st.text(max_size=8),
+        'roi': st.builds(RegionOfInterest, x_offset=UINT32, y_offset=UINT32, width=UINT32, height=UINT32,
+                         do_rectify=st.booleans())})
+
+
+def is_explained(error: str, *topics: str) -> bool:
+    """One sentence that begins with the topic that it is about, and says more than that."""
+    return '\n' not in error.strip() and any(re.match(rf'{topic}: .{{20}}|.*{topic}.{{20}}', error) for topic in topics)
+
+
+def assert_clean(depth: np.ndarray) -> None:
+    assert depth.dtype == np.float32 and depth.flags.c_contiguous and depth.flags.writeable
+    assert np.isfinite(depth).all() and (depth >= 0).all()
+
+
+@pytest.fixture
+def limited_memory() -> Iterator[None]:
+    """A claim of more memory than ALLOCATION fails here, where it would take down a small computer elsewhere."""
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    pages = int(Path('/proc/self/statm').read_text().split()[0])
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + ALLOCATION, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+@FUZZ
+@given(message=images())
+def test_images(limited_memory: None, message: Image) -> None:
+    try:
+        depth = decode_image(message, source=TOPIC)
+    except InputError as error:
+        assert is_explained(str(error), TOPIC)
+        event('refused')
+        return
+    event('decoded')
+    assert depth.shape == (message.height, message.width)
+    assert_clean(depth)
+    kind = ('>' if message.is_bigendian else '<') + ('f' if message.encoding == '32FC1' else 'H')
+    for v, u in ((0, 0), (message.height // 2, message.width // 2), (message.height - 1, message.width - 1)):
+        [value] = struct.unpack_from(kind, message.data, v * message.step + u * struct.calcsize(kind))
+        value = value * 0.001 if kind[1] == 'H' else value if np.finfo(np.float32).tiny <= value < np.inf else 0
+        assert depth[v, u] == pytest.approx(value, rel=1e-6)
+
+
+@FUZZ
+@given(message=compressed_images())
+def test_compressed_images(limited_memory: None, message: CompressedImage) -> None:
+    try:
+        depth = decode_compressed(message, source=TOPIC)
+    except InputError as error:
+        assert is_explained(str(error), TOPIC)
+        event('refused')
+        return
+    event('decoded')
+    assert_clean(depth)
+    data = bytes(message.data)
+    start = 0 if data[:8] == b'\x89PNG\r\n\x1a\n' else 12
+    rvl = 'rvl' in message.format.replace(';', ' ').split()
+    width, height = struct.unpack_from('<II', data, start) if rvl else struct.unpack_from('>II', data, start + 16)
+    assert depth.shape == (height, width), 'another size than the image itself says'
+
+
+@FUZZ
+@given(message=camera_infos(480, 640), rectified=st.booleans())
+def test_camera_infos(message: CameraInfo, rectified: bool) -> None:
+    camera = Camera(INFO_TOPIC)
+    camera.update(message)
+    try:
+        intrinsics = camera.intrinsics(640, 480, Params(camera_info_timeout=0.0, use_rectified=rectified))
+    except InputError as error:
+        assert is_explained(str(error), INFO_TOPIC)
+        event('refused')
+        return
+    event('used')
+    assert (intrinsics.width, intrinsics.height) == (640, 480) and intrinsics.fx > 0 and intrinsics.fy > 0
+    assert np.isfinite([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy]).all()
+
+
+@pytest.fixture(scope='module', params=['raw', 'compressedDepth'])
+def node(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[EstimatorNode]:
+    """A node that is called directly, as DDS would not let half of the messages through, and answers into `said`."""
+    weights = tmp_path_factory.mktemp('weights') / 'untrained.safetensors'
+    save_checkpoint(weights, build('deep_prior', joints=21), {'skeleton': 'hand21', 'cube_side': 0.3})
+    context = rclpy.Context()
+    context.init(domain_id=99)
+    values = {'model': str(weights), 'min_score': 0.0, 'camera_info_timeout': 0.0, 'max_hands': 2, 'smoothing': 1.0,
+              'num_threads': 1, 'publish_poses': True, 'publish_joint_states': True, 'transport': request.param}
+    node = EstimatorNode(context=context, namespace='/fuzz',
+                         parameter_overrides=[Parameter(name, value=value) for name, value in values.items()])
+    for kind, topic in ((MarkerArray, 'hand/markers'), (Image, '~/debug/crop')):  # made for listeners only
+        node.create_subscription(kind, topic, lambda _: None, 1)
+    node.said = []
+    publish = node._outputs._joints_pub.publish
+    node._outputs._joints_pub.publish = lambda message: (node.said.append(message), publish(message))
+    yield node
+    node.destroy_node()
+    context.shutdown()
+
+
+@FUZZ
+@given(data=st.data())
+def test_the_node(node: EstimatorNode, data: st.DataObject) -> None:
+    """Each image is answered or refused, and never by an error that nobody thought of."""
+    message = data.draw(images() if node._image_type is Image else compressed_images())
+    if data.draw(st.integers(0, 9)):
+        try:
+            size = node._decode(message).shape
+        except InputError:
+            size = 20, 20
+        node._on_camera_info(data.draw(camera_infos(*size)))
+    node.said.clear()
+    node._statistics._window.problem = ''
+    before, totals = dict(node._statistics._totals), node._statistics._totals
+    node._answer(message)
+    problem = node._statistics._window.problem
+    assert totals['answered'] + totals['refused'] == before.get('answered', 0) + before.get('refused', 0) + 1, problem
+    assert not problem or is_explained(problem, node._image_topic, node._camera.topic), problem
+    assert len(node.said) == totals['answered'] - before.get('answered', 0)
+    event(f'{len(node.said[0].hands)} hands' if node.said else 'refused')
+    for answer in node.said:
+        assert isinstance(answer, HandJointsArray) and answer.header == message.header
+        for hand in answer.hands:
+            joints = np.array([(joint.x, joint.y, joint.z) for joint in hand.joints])
+            assert joints.shape == (21, 3) and np.isfinite(joints).all() and np.abs(joints).max() < 100
+            assert len(hand.confidence) == 21 and all(0 <= c <= 1 for c in hand.confidence) and 0 <= hand.score <= 1

@@ -7,7 +7,7 @@ next one need not be searched.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import count
@@ -32,8 +32,11 @@ RECENTER_M = 0.015
 """A cube whose centre is further than this from the middle of the joints it gave is moved there and read again."""
 LOOKS = 3
 """How often at most: on synthetic images two looks find a hand more often than one, and three more often than two."""
-FALSE_ALARMS = 2
-"""How many objects that are no hand are looked at in an image before the search is given up."""
+FALSE_ALARMS = 3
+"""After so many objects that are no hand, the search is given up until the next image."""
+SEARCH_EVERY = 5
+"""While a hand is tracked, every so many images are worth a look at one more object: to search costs several times as
+much as to track."""
 FRAME_S = 1 / 30
 """Time between images for smoothing, where the caller does not say."""
 SIDE_MEMORY = 0.9
@@ -96,8 +99,9 @@ class HandPoseEstimator:
         skeleton: the joints that the network gives.
         cube_side: length of the cube's side in metres; the network was trained for about this size.
         side: 'auto' finds out which hand it is; 'left' or 'right' states it.
-        max_hands: at most this many hands per image.
-        min_score: hands with a lower score are not reported.
+        max_hands: at most this many hands per image (the node and the command line take 2; evaluation, benchmarks and
+            labels are about one).
+        min_score: hands with a lower score are not reported; one beside another must begin with its square root.
         near, far: range in which hands are looked for, metres.
         tracking: look first where the hands of the last image were.
         smoothing: cutoff in Hz of a filter on the joints of a tracked hand at rest (see `smoothing`); 0 = none.
@@ -121,6 +125,8 @@ class HandPoseEstimator:
         self._tracks: list[_Track] = []
         self._ids = count(1)
         self._last_s: float | None = None
+        self._dismissed: list[Cube] = []
+        self._since_search = 0
 
     @classmethod
     def from_pretrained(cls, model: str | PathLike[str] | None = None, *, device: str = 'auto',
@@ -183,25 +189,45 @@ class HandPoseEstimator:
                 hands.append(self._follow(track, reading, dt))
             else:
                 self._tracks.remove(track)
-        if len(hands) < self.max_hands:
-            cubes = candidates(depth, intrinsics, side=self.cube_side, near=self.near, far=self.far, regions=regions)
-            # Objects that prove to be no hand must not hide one behind them, nor cost time without end.
-            for _ in range(self.max_hands + FALSE_ALARMS):
-                with self._timed('detect'):
-                    found = next(cubes, None) if len(hands) < self.max_hands else None
-                if found is None:
-                    break
-                if _overlaps(found, hands):
-                    continue
-                track = _Track(id='', center=found.center)
-                reading = self._read(depth, intrinsics, found, track)
-                if reading.score >= self.min_score and not _overlaps(reading.cube, hands):
-                    track.id = f'hand_{next(self._ids)}'
-                    self._tracks.append(track)
-                    hands.append(self._follow(track, reading, dt))
+        self._find(depth, intrinsics, hands, dt, regions)
         if not self.tracking:
             self._tracks.clear()
         return hands
+
+    def _find(self, depth: NDArray[np.float32], intrinsics: Intrinsics, hands: list[HandEstimate], dt: float,
+              regions: Sequence[Region] | None) -> None:
+        """Search for hands, add them to `hands`, and track them.
+
+        Without a hand, everything near is searched at once. Beside a tracked hand there is mostly none: then only every
+        so many images are searched, for one object that was not looked at before, until all were.
+        """
+        self._since_search += 1
+        if not hands or len(hands) >= self.max_hands:
+            self._dismissed.clear()
+        if len(hands) >= self.max_hands or (hands and self._since_search < SEARCH_EVERY):
+            return
+        self._since_search, alarms = 0, 1 if hands else FALSE_ALARMS
+        cubes = candidates(depth, intrinsics, side=self.cube_side, near=self.near, far=self.far, regions=regions)
+        # Objects that prove to be no hand must not hide one behind them, nor cost time without end.
+        while alarms > 0 and len(hands) < self.max_hands:
+            with self._timed('detect'):
+                found = next(cubes, None)
+            if found is None:
+                self._dismissed.clear()
+                break
+            if _overlaps(found, hands, self._dismissed):
+                continue
+            track = _Track(id='', center=found.center)
+            reading = self._read(depth, intrinsics, found, track)
+            # Where there is a hand, a face or an elbow beside it often scores min_score, hardly ever its square root.
+            enough = max(self.min_score, 0) ** 0.5 if hands else self.min_score
+            if reading.score < enough or _overlaps(reading.cube, hands):
+                self._dismissed.append(found)
+                alarms -= 1
+                continue
+            track.id = f'hand_{next(self._ids)}'
+            self._tracks.append(track)
+            hands.append(self._follow(track, reading, dt))
 
     def _read(self, depth: NDArray[np.float32], intrinsics: Intrinsics, cube: Cube, track: _Track) -> _Reading:
         """Look into a cube, and again where its joints are: from an arm that was found first, to the hand."""
@@ -268,6 +294,7 @@ class HandPoseEstimator:
         self.timings[stage] += time.perf_counter() - start
 
 
-def _overlaps(cube: Cube, hands: list[HandEstimate]) -> bool:
-    """Whether a cube looks at a hand that was already found."""
-    return any(np.linalg.norm(np.subtract(cube.center, hand.cube.center)) < cube.side / 3 for hand in hands)
+def _overlaps(cube: Cube, hands: Iterable[HandEstimate], others: Iterable[Cube] = ()) -> bool:
+    """Whether a cube looks at a hand that was already found, or at what one of the others looks at."""
+    seen = [*(hand.cube for hand in hands), *others]
+    return any(np.linalg.norm(np.subtract(cube.center, other.center)) < cube.side / 3 for other in seen)

@@ -63,8 +63,9 @@ def bag(tmp_path, depths):
 
 @pytest.fixture
 def command(weights):
-    """Run `hand-pose estimate` with weights that are there; every hand counts."""
-    return lambda *args: main(['estimate', *map(str, args), '--model', str(weights), '--min-score', '0'])
+    """Run `hand-pose estimate` with weights that are there; every hand counts, and to them everything is a hand."""
+    return lambda *args: main(['estimate', *map(str, args), '--model', str(weights), '--min-score', '0',
+                               '--max-hands', '1'])
 
 
 @pytest.fixture

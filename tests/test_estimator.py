@@ -62,6 +62,43 @@ def test_one_hand_keeps_its_name_until_reset(estimator, sequence):
     assert estimator(sequence[0].depth, sequence[0].intrinsics)[0].id not in names
 
 
+@pytest.fixture(scope='module')
+def sequence_of_two(sequence):
+    """The hand, and beside it the same once more."""
+    def once_more(frame):
+        beside = np.zeros_like(frame.depth)
+        beside[:, 200:] = frame.depth[:, :-200]
+        depth = np.where((beside > 0) & ((frame.depth == 0) | (beside < frame.depth)), beside, frame.depth)
+        return SimpleNamespace(depth=depth, intrinsics=frame.intrinsics)
+    return [once_more(frame) for frame in sequence]
+
+
+def test_two_hands_are_found_at_once_and_keep_their_names(sequence_of_two):
+    estimator = HandPoseEstimator.from_pretrained(DEFAULT, device='cpu', max_hands=2)
+    images = [estimator(frame.depth, frame.intrinsics) for frame in sequence_of_two]
+    assert {tuple(hand.id for hand in hands) for hands in images} == {('hand_1', 'hand_2')}
+    assert all(np.linalg.norm(np.subtract(*(hand.cube.center for hand in hands))) > 0.15 for hands in images)
+
+
+def test_a_second_hand_that_enters_is_found_soon(sequence, sequence_of_two):
+    estimator = HandPoseEstimator.from_pretrained(DEFAULT, device='cpu', max_hands=2)
+    images = [estimator(frame.depth, frame.intrinsics) for frame in sequence[:10] + sequence_of_two[10:]]
+    assert {len(hands) for hands in images[:10]} == {1} and {len(hands) for hands in images[20:]} == {2}
+    assert {hands[0].id for hands in images} == {'hand_1'}
+
+
+def test_one_hand_is_followed_while_a_second_is_missing_at_little_cost(sequence, monkeypatch):
+    """To search costs several times as much as to track: most images do without."""
+    def looks(max_hands):
+        estimator = HandPoseEstimator.from_pretrained(DEFAULT, device='cpu', max_hands=max_hands)
+        run_full, shown = estimator.engine.run_full, []
+        monkeypatch.setattr(estimator.engine, 'run_full', lambda patches: shown.append(1) or run_full(patches))
+        return np.diff([len(estimator(frame.depth, frame.intrinsics)) and len(shown) for frame in sequence])
+
+    more = looks(2) - looks(1)  # behind the first image
+    assert (more == 0).sum() >= 0.75 * len(more) and 0 < more.max() <= 3
+
+
 def test_a_mirrored_scene_gives_mirrored_joints_of_the_other_hand(estimator, sequence):
     estimator.reset()
     for frame in sequence:

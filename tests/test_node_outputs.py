@@ -244,7 +244,7 @@ def test_hands_are_looked_for_in_the_region_that_is_given(rig: Rig) -> None:
     assert x < -0.1
     assert found(RegionOfInterest()) == []
     assert found(RegionOfInterest(x_offset=2**32 - 1, y_offset=2**32 - 1, width=2**32 - 1, height=2**32 - 1)) == []
-    assert len(found(RegionOfInterest(width=2**32 - 1, height=2**32 - 1))) == 1
+    assert len(found(RegionOfInterest(width=2**32 - 1, height=2**32 - 1))) == 2
     assert not rig.set_parameter('detector', 'nearest')[0]
 
 

@@ -59,7 +59,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('--device', default='auto', help='auto, cpu, cuda or cuda:N (auto)')
     parser.add_argument('--side', default='auto', choices=('auto', 'left', 'right'), help='which hand it is (auto)')
     parser.add_argument('--cube-size', type=float, metavar='M', help='side of the cube around a hand, metres')
-    parser.add_argument('--max-hands', type=int, default=1, metavar='N', help='at most N hands per image (1)')
+    parser.add_argument('--max-hands', type=int, default=2, metavar='N', help='at most N hands per image (2)')
     parser.add_argument('--min-score', type=float, default=0.3, metavar='S',
                         help='leave out hands below this score (0.3)')
     parser.add_argument('--out', type=Path, metavar='FILE', help='.npz or .mcap')

@@ -140,7 +140,8 @@ def _evaluate_live(args: argparse.Namespace, settings: Settings) -> Result:
     from hand_pose_ros.skeleton import get_skeleton
 
     parameters = {'model': args.model, 'device': args.device, 'side': args.side, 'cube_size': args.cube_size,
-                  'min_score': args.min_score, 'depth_scale': args.depth_scale}
+                  'min_score': args.min_score, 'depth_scale': args.depth_scale,
+                  'max_hands': 1}  # as without the node: one hand is compared, and others would cost time
     if args.intrinsics:
         parameters |= {f'intrinsics.{name}': value for name, value in zip(('fx', 'fy', 'cx', 'cy'), args.intrinsics,
                                                                           strict=True)}

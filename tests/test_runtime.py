@@ -8,12 +8,14 @@ import logging
 import numpy as np
 import pytest
 import torch
+from torch import nn
 
 from hand_pose_ros.cli import main
 from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.models import build
 from hand_pose_ros.runtime import default_threads, make_engine
 from hand_pose_ros.runtime.engine import Pipeline, TorchEngine
+from hand_pose_ros.runtime.lanes import PairedConvolution, fill_lanes
 
 MM_PER_UNIT = 150
 """A cube of 0.30 m has 150 mm from its centre to a face."""
@@ -93,6 +95,27 @@ def test_the_cpu_engine_refines_as_plain_pytorch_does(architecture, refiner):
             expected = second(torch.from_numpy(patches), first).numpy()
         assert np.abs(expected - first.numpy()).max() > 0.02
         assert np.abs(engine.run(patches) - expected).max() * MM_PER_UNIT <= 0.05
+
+
+@pytest.mark.parametrize(('channels', 'kernel', 'pool', 'size'), [
+    (8, 5, 4, 128), (8, 5, 2, 31), (3, 3, 2, 16), (8, 4, 2, 9)])
+def test_two_pixels_at_a_time_give_the_same(channels, kernel, pool, size):
+    torch.manual_seed(0)
+    block = nn.Sequential(nn.Conv2d(2, channels, kernel), nn.MaxPool2d(pool), nn.ReLU())
+    patches = torch.randn(3, 2, size, size)
+    expected = block(patches)
+    fill_lanes(block)
+    assert isinstance(block[0], PairedConvolution)
+    torch.testing.assert_close(block(patches), expected, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize('block', [
+    [nn.Conv2d(1, 12, 3), nn.MaxPool2d(2)], [nn.Conv2d(1, 8, 3), nn.MaxPool2d(3)], [nn.Conv2d(1, 8, 3), nn.ReLU()],
+    [nn.Conv2d(1, 8, 3, padding=1), nn.MaxPool2d(2)], [nn.Conv2d(2, 8, 3, groups=2), nn.MaxPool2d(2)]])
+def test_what_would_not_gain_or_not_be_equal_stays(block):
+    network = nn.Sequential(*block)
+    fill_lanes(network)
+    assert list(network) == block
 
 
 def test_hands_do_not_influence_each_other():

@@ -11,6 +11,7 @@ from torch import nn
 
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.runtime.engine import Engine, Pipeline, TorchEngine
+from hand_pose_ros.runtime.lanes import fill_lanes
 from hand_pose_ros.runtime.onnx_engine import OnnxEngine
 
 __all__ = ['Engine', 'default_threads', 'make_engine']
@@ -47,6 +48,8 @@ def make_engine(network: nn.Module, device: str = 'auto', num_threads: int | Non
     engine: Engine
     if device == 'cpu':
         threads = num_threads or default_threads()
+        if torch.backends.cpu.get_cpu_capability() == 'AVX512':
+            fill_lanes(pipeline)
         engine = OnnxEngine(pipeline, threads)
         why += f'; {threads} threads'
     elif device.startswith('cuda'):

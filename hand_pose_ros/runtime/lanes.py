@@ -1,0 +1,54 @@
+"""Convolutions of few channels, rearranged for processors that work on 16 numbers at a time."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+LANES = 16
+"""Float32 numbers in a register of AVX-512, and channels in a block of ONNX Runtime's convolutions there."""
+
+
+class PairedConvolution(nn.Module):
+    """A valid convolution for at most LANES / 2 channels, and max pooling of even width, for two pixels at a time.
+
+    With 8 channels half of the lanes would stay idle. A filter that is one pixel wider, once with its weights to the
+    left and once to the right, gives two neighbouring pixels as 16 channels, whose maximum the pooling takes at last.
+    The arithmetic is the same but for products with zero.
+    """
+
+    def __init__(self, convolution: nn.Conv2d, pool: int) -> None:
+        super().__init__()
+        channels, _, height, width = convolution.weight.shape
+        self.pair = nn.Conv2d(convolution.in_channels, 2 * channels, (height, width + 1), stride=(1, 2))
+        self.pool = nn.MaxPool2d((pool, pool // 2))
+        with torch.no_grad():
+            self.pair.weight.zero_()
+            self.pair.weight[:channels, :, :, :width] = convolution.weight
+            self.pair.weight[channels:, :, :, 1:] = convolution.weight
+            if convolution.bias is not None and self.pair.bias is not None:
+                self.pair.bias.copy_(convolution.bias.repeat(2))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, H, W) -> what pooling the convolution would give."""
+        left, right = self.pool(self.pair(x)).chunk(2, dim=1)
+        return torch.maximum(left, right)
+
+
+def fill_lanes(module: nn.Module) -> None:
+    """Replace, wherever they follow each other in a Sequential, small convolutions and their pooling by pairs."""
+    for each in module.modules():
+        if not isinstance(each, nn.Sequential) or len(each) < 2:
+            continue
+        convolution, pool = each[0], each[1]
+        if not isinstance(convolution, nn.Conv2d) or not isinstance(pool, nn.MaxPool2d):
+            continue
+        size = pool.kernel_size
+        if isinstance(size, int) and size % 2 == 0 and _is_plain(convolution, pool):
+            each[0], each[1] = PairedConvolution(convolution, size), nn.Identity()
+
+
+def _is_plain(convolution: nn.Conv2d, pool: nn.MaxPool2d) -> bool:
+    return (2 * convolution.out_channels <= LANES and convolution.groups == 1 and convolution.stride == (1, 1)
+            and convolution.padding == (0, 0) and convolution.dilation == (1, 1)
+            and pool.stride == pool.kernel_size and not pool.padding and not pool.ceil_mode)

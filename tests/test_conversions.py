@@ -16,7 +16,7 @@ from visualization_msgs.msg import Marker
 
 from hand_pose_ros import markers as markers_module
 from hand_pose_ros.drawing import FINGER_COLORS
-from hand_pose_ros.errors import HandPoseError
+from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.estimator import HandEstimate
 from hand_pose_ros.geometry import Cube, Intrinsics
 from hand_pose_ros.markers import HandMarkers
@@ -114,6 +114,20 @@ def test_binning_and_region_of_interest() -> None:
     camera.update(info(binning_x=2, binning_y=2,
                        roi=RegionOfInterest(x_offset=100, y_offset=40, width=320, height=240)))
     assert camera.intrinsics(160, 120, Params()) == Intrinsics(250, 255, 110, 100, 160, 120)
+
+
+@pytest.mark.parametrize('k', [
+    [1e-300, 0, 320, 0, 1e-300, 240, 0, 0, 1], [1e9, 0, 320, 0, 1e9, 240, 0, 0, 1],
+    [500, 0, 1e300, 0, 500, 240, 0, 0, 1]])
+def test_intrinsics_of_no_lens_are_refused(k: list[float]) -> None:
+    """Found by fuzzing: areas became infinite, and the search for a hand ended in an IndexError."""
+    camera = Camera('/camera_info')
+    camera.update(info(k=k))
+    with pytest.raises(InputError, match=r'^/camera_info: .* no camera of 640x480 pixels'):
+        camera.intrinsics(640, 480, Params())
+    given_ = Params(intrinsics_fx=1e-5, intrinsics_fy=1e-5)
+    with pytest.raises(InputError, match=r'^parameters intrinsics\.\*: .* no camera of 640x480 pixels'):
+        camera.intrinsics(640, 480, given_)
 
 
 def test_depth_that_cannot_hold_a_hand_is_explained() -> None:

@@ -242,18 +242,20 @@ def test_the_node(node: EstimatorNode, data: st.DataObject) -> None:
         except InputError:
             size = 20, 20
         node._on_camera_info(data.draw(camera_infos(*size)))
+    node._estimator.reset()
     node.said.clear()
-    node._statistics._window.problem = ''
-    before, totals = dict(node._statistics._totals), node._statistics._totals
-    node._answer(message)
-    problem = node._statistics._window.problem
-    assert totals['answered'] + totals['refused'] == before.get('answered', 0) + before.get('refused', 0) + 1, problem
-    assert not problem or is_explained(problem, node._image_topic, node._camera.topic), problem
-    assert len(node.said) == totals['answered'] - before.get('answered', 0)
+    for _ in range(2):  # a hand that was found is tracked in the second
+        before, totals = dict(node._statistics._totals), node._statistics._totals
+        node._statistics._window.problem = ''
+        node._answer(message)
+        problem = node._statistics._window.problem
+        assert totals['answered'] + totals['refused'] == before.get('answered', 0) + before.get('refused', 0) + 1
+        assert not problem or is_explained(problem, node._image_topic, node._camera.topic), problem
     event(f'{len(node.said[0].hands)} hands' if node.said else 'refused')
+    assert len(node.said) in (0, 2)
     for answer in node.said:
         assert isinstance(answer, HandJointsArray) and answer.header == message.header
         for hand in answer.hands:
             joints = np.array([(joint.x, joint.y, joint.z) for joint in hand.joints])
-            assert joints.shape == (21, 3) and np.isfinite(joints).all() and np.abs(joints).max() < 100
+            assert joints.shape == (21, 3) and np.isfinite(joints).all() and np.abs(joints).max() < 500
             assert len(hand.confidence) == 21 and all(0 <= c <= 1 for c in hand.confidence) and 0 <= hand.score <= 1

@@ -6,9 +6,13 @@ import threading
 
 from sensor_msgs.msg import CameraInfo
 
-from hand_pose_ros.errors import InputError
+from hand_pose_ros.errors import InputError, naming
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.ros.params import Params
+
+MAX_SLOPE, MIN_SLOPE = 100.0, 1e-4
+"""Of the rays at the border of an image against the axis of the camera (89.4 degrees, and a fraction of a minute of
+arc). Beyond them the intrinsics are those of no lens, and what is computed with them may be anything."""
 
 
 class Camera:
@@ -30,6 +34,10 @@ class Camera:
             self._info = info
             self._changed.notify_all()
 
+    def open(self) -> None:
+        """Wait again where one is missing. What arrived before still holds: some drivers publish it only once."""
+        self._closed = False
+
     def close(self) -> None:
         """End all waiting."""
         with self._changed:
@@ -40,22 +48,24 @@ class Camera:
         """For an image of this size; waits a moment for a camera_info that is late.
 
         Raises:
-            InputError: there is none, it is not calibrated, or it describes an image of another size.
+            InputError: there is none, it is not calibrated, it describes an image of another size, or no lens is so.
         """
         if params.intrinsics_fx > 0:
-            return Intrinsics(params.intrinsics_fx, params.intrinsics_fy, params.intrinsics_cx, params.intrinsics_cy,
-                              width, height)
+            intrinsics = Intrinsics(params.intrinsics_fx, params.intrinsics_fy, params.intrinsics_cx,
+                                    params.intrinsics_cy, width, height)
+            with naming('parameters intrinsics.*'):
+                _check_lens(intrinsics)
+            return intrinsics
         with self._changed:
             self._changed.wait_for(lambda: self._closed or self._fits(width, height), params.camera_info_timeout)
             info = self._info
         if info is None:
             raise InputError(f'no camera_info arrived on {self.topic}: publish it beside the depth image, remap '
                              'depth/camera_info, or set the parameters intrinsics.fx, .fy, .cx and .cy')
-        try:
+        with naming(self.topic):
             intrinsics = Intrinsics.from_camera_info(info, rectified=params.use_rectified)
             intrinsics.check_size(width, height)
-        except InputError as error:
-            raise InputError(f'{self.topic}: {error}') from None
+            _check_lens(intrinsics)
         return intrinsics
 
     def source(self, params: Params) -> str:
@@ -80,3 +90,12 @@ class Camera:
         except InputError:
             return False
         return True
+
+
+def _check_lens(intrinsics: Intrinsics) -> None:
+    for focal, center, size in ((intrinsics.fx, intrinsics.cx, intrinsics.width),
+                                (intrinsics.fy, intrinsics.cy, intrinsics.height)):
+        if max(abs(center), abs(size - center)) > MAX_SLOPE * focal or size < MIN_SLOPE * focal:
+            raise InputError(f'a focal length of {focal:g} and a principal point at {center:g} pixels are those of no '
+                             f'camera of {intrinsics.width}x{intrinsics.height} pixels: calibrate it, or set the '
+                             'parameters intrinsics.fx, .fy, .cx and .cy')

@@ -89,6 +89,8 @@ class EstimatorNode(LifecycleNode):
         """Load the network and create the publishers."""
         estimator = self._params.make_estimator()
         self._outputs = Outputs(self, estimator, self._params, self._complain)
+        self._image_topic, info_topic = topics.input_topics(self, self._params.transport)
+        self._camera = Camera(info_topic)
         self._estimator = estimator
         return super().on_configure(state)
 
@@ -138,19 +140,18 @@ class EstimatorNode(LifecycleNode):
             torch.cuda.empty_cache()
 
     def _start(self) -> None:
-        image_topic, info_topic = topics.input_topics(self, self._params.transport)
         raw = self._params.transport == 'raw'
         self._image_type, self._decode = (Image, decode_image) if raw else (CompressedImage, decode_compressed)
-        self._camera = Camera(info_topic)
+        self._camera.open()
         self._last_header = Header()
         self._heard_at, self._silent = time.monotonic(), False
         self._regions: list[Region] = []
-        inputs = [(CameraInfo, info_topic, self._on_camera_info), (self._image_type, image_topic, self._on_image)]
+        inputs = [(CameraInfo, self._camera.topic, self._on_camera_info),
+                  (self._image_type, self._image_topic, self._on_image)]
         if self._params.detector == 'region':
             inputs.append((RegionOfInterest, self.resolve_topic_name(topics.REGION), self._on_region))
         for kind, topic, callback in inputs:
             self._inputs.append(topics.subscribe(self, kind, topic, callback, self._complain))
-        self._image_topic = self._inputs[1].topic_name
         self._worker = NewestWorker(self._answer)
         self.get_logger().info(f'listening to {", ".join(sorted(listener.topic_name for listener in self._inputs))}')
 

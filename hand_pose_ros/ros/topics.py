@@ -74,7 +74,8 @@ def explain_silence(node: Node, topic: str, message_type: type, seconds: float) 
     said = f'no image arrived on {topic} for {seconds:.0f} s; the topic is {describe_publishers(node, topic)}'
     infos = node.get_publishers_info_by_topic(topic)
     if not infos:
-        others = [name for name, types in node.get_topic_names_and_types() if topic_type in types and name != topic]
+        ours = {topic, *(publisher.topic_name for publisher in node.publishers)}
+        others = [name for name, types in node.get_topic_names_and_types() if topic_type in types and name not in ours]
         where = f' ({topic_type} is published on {", ".join(others)})' if others else ''
         return f'{said}{where}: start the camera, or name its topic with --ros-args -r {IMAGE}:=/its/topic'
     if all(info.topic_type != topic_type for info in infos):

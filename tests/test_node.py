@@ -495,7 +495,12 @@ def test_silence_names_the_topic_and_its_publishers(rig: Rig, monkeypatch: pytes
     monkeypatch.setattr(node_module, 'SILENCE_S', 0.1)
     rig.client.create_publisher(Image, '/somewhere/else', RELIABLE)
     rig.start()
-    rig.until_said('/depth/image_rect', 'without any publisher', '(sensor_msgs/msg/Image is published on /somewhere/else)')
+    rig.until_said('/depth/image_rect', 'without any publisher', '(sensor_msgs/msg/Image is published on /somewhere/')
+    # In the diagnostics as long as it lasts: first as a warning, then as the reason of staleness.
+    reports = rig.received[DiagnosticArray]
+    rig.until(lambda: reports and '/somewhere' in reports[-1].status[0].message
+              and reports[-1].status[0].level == b'\x03', 'staleness')
+    assert sum('/somewhere/else' in text for text in rig.said()) == 1
 
 
 def test_incompatible_quality_of_service_is_named_with_its_remedy(rig: Rig) -> None:

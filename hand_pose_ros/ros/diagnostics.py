@@ -43,10 +43,11 @@ class Statistics:
 
     Attributes:
         failure: why the node could not do as it was told, empty if it could.
+        silence: why images stay away, empty if they do not.
     """
 
     def __init__(self) -> None:
-        self.failure = ''
+        self.failure = self.silence = ''
         self._lock = threading.Lock()
         self._window = _Window()
         self._totals: Counter[str] = Counter()
@@ -98,7 +99,7 @@ class Statistics:
             totals = dict(self._totals)
         elapsed = time.perf_counter() - window.since
         counts = window.counts
-        level, message = (DiagnosticStatus.ERROR, self.failure) if self.failure else _judge(window, state)
+        level, message = (DiagnosticStatus.ERROR, self.failure) if self.failure else _judge(window, state, self.silence)
         values = {'state': state, 'input_hz': f'{counts["received"] / elapsed:.1f}',
                   'output_hz': f'{counts["answered"] / elapsed:.1f}'}
         for stage, seconds in window.seconds.items():
@@ -111,7 +112,7 @@ class Statistics:
                                 values=[KeyValue(key=key, value=value) for key, value in values.items()])
 
 
-def _judge(window: _Window, state: str) -> tuple[bytes, str]:
+def _judge(window: _Window, state: str, silence: str) -> tuple[bytes, str]:
     """Level and message: the worst that happened."""
     counts = window.counts
     if window.problem:
@@ -122,7 +123,7 @@ def _judge(window: _Window, state: str) -> tuple[bytes, str]:
         return DiagnosticStatus.WARN, (f'{counts["camera_infos"]} camera_info but only {counts["received"]} images '
                                        f'arrived in a second: if there should be as many, {remedy_for_lost_images()}')
     if counts['received'] == 0:
-        return DiagnosticStatus.STALE, 'no images'
+        return DiagnosticStatus.STALE, silence or 'no images'
     if counts['received'] >= MIN_SAMPLE and counts['dropped'] > MAX_DROPPED * counts['received']:
         return DiagnosticStatus.WARN, (f'{counts["dropped"]} of {counts["received"]} images of a second were dropped: '
                                        'this machine is too slow, or too busy, for their rate')

@@ -144,7 +144,7 @@ class EstimatorNode(LifecycleNode):
         self._image_type, self._decode = (Image, decode_image) if raw else (CompressedImage, decode_compressed)
         self._camera.open()
         self._last_header = Header()
-        self._heard_at, self._silent = time.monotonic(), False
+        self._heard_at, self._statistics.silence = time.monotonic(), ''
         self._regions: list[Region] = []
         inputs = [(CameraInfo, self._camera.topic, self._on_camera_info),
                   (self._image_type, self._image_topic, self._on_image)]
@@ -169,7 +169,7 @@ class EstimatorNode(LifecycleNode):
     # Callbacks
 
     def _on_image(self, image: Image | CompressedImage) -> None:
-        self._heard_at, self._silent = time.monotonic(), False
+        self._heard_at, self._statistics.silence = time.monotonic(), ''
         self._statistics.count(received=1, dropped=int(self._worker is not None and self._worker.put(image)))
 
     def _on_camera_info(self, info: CameraInfo) -> None:
@@ -204,9 +204,9 @@ class EstimatorNode(LifecycleNode):
 
     def _on_timer(self) -> None:
         quiet = time.monotonic() - self._heard_at if self._worker is not None else 0
-        if quiet > SILENCE_S and not self._silent:
-            self._silent = True
-            self._complain(topics.explain_silence(self, self._image_topic, self._image_type, quiet))
+        if quiet > SILENCE_S and not self._statistics.silence:
+            self._statistics.silence = topics.explain_silence(self, self._image_topic, self._image_type, quiet)
+            self._complain(self._statistics.silence)
         status = self._statistics.report(self.get_name(), self._state, self._facts())
         if status.level == DiagnosticStatus.WARN:
             self._say(status.message)

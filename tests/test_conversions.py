@@ -109,6 +109,13 @@ def test_rectified_images_take_p_and_raw_ones_k() -> None:
     assert camera.intrinsics(10, 20, given_) == Intrinsics(1, 2, 3, 4, 10, 20)
 
 
+def test_a_bad_projection_matrix_does_not_hold_up_raw_images() -> None:
+    camera = Camera('/camera_info')
+    camera.update(info(p=[-1.0] * 12))
+    assert camera._fits(640, 480, rectified=False) and not camera._fits(640, 480, rectified=True)
+    assert camera.intrinsics(640, 480, Params(use_rectified=False)).fx == 500
+
+
 def test_binning_and_region_of_interest() -> None:
     camera = Camera('/camera_info')
     camera.update(info(binning_x=2, binning_y=2,

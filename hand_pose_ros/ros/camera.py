@@ -57,7 +57,8 @@ class Camera:
                 _check_lens(intrinsics)
             return intrinsics
         with self._changed:
-            self._changed.wait_for(lambda: self._closed or self._fits(width, height), params.camera_info_timeout)
+            self._changed.wait_for(lambda: self._closed or self._fits(width, height, params.use_rectified),
+                                   params.camera_info_timeout)
             info = self._info
         if info is None:
             raise InputError(f'no camera_info arrived on {self.topic}: publish it beside the depth image, remap '
@@ -82,11 +83,11 @@ class Camera:
         return (f'its frame_id is {frame_id!r:.80} but that of {self.topic} is {info.header.frame_id!r:.80}: if they '
                 'are different cameras, the joints are wrong; remap depth/camera_info to the one of the depth image')
 
-    def _fits(self, width: int, height: int) -> bool:
+    def _fits(self, width: int, height: int, rectified: bool) -> bool:
         if self._info is None:
             return False
         try:
-            Intrinsics.from_camera_info(self._info).check_size(width, height)
+            Intrinsics.from_camera_info(self._info, rectified=rectified).check_size(width, height)
         except InputError:
             return False
         return True

@@ -22,6 +22,7 @@ VERBS = {
     'evaluate': 'score a prediction file, or the estimator on a bag',
     'compare': 'several results side by side',
     'train': 'train a network from a recipe',
+    'adapt': 'fine-tune a network to your camera, from a bag without labels',
     'experiment': 'repeat an experiment of the paper',
     'synth': 'make or show synthetic depth hands',
     'bench': 'measure speed on this machine',

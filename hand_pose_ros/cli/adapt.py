@@ -1,0 +1,155 @@
+"""`hand-pose adapt`: fine-tune a network to a camera of one's own, from a bag without labels."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hand_pose_ros.errors import HandPoseError
+
+if TYPE_CHECKING:
+    from hand_pose_ros.evaluation.bag_evaluation import Progress
+    from hand_pose_ros.models.checkpoints import Checkpoint
+    from hand_pose_ros.runtime import Engine
+    from hand_pose_ros.training.adapt import Look, Numbers
+
+_EXAMPLES = """examples:
+  hand-pose adapt my_hand.mcap --out my_camera.safetensors
+  hand-pose adapt old.bag --depth-topic /camera/depth/image_raw --side left --out my_camera.safetensors
+  hand-pose adapt labelled.mcap --ground-truth /truth/joints --out my_camera.safetensors
+  hand-pose estimate other.mcap --model my_camera.safetensors --overlay pictures
+
+Record one hand, alone before the camera, that turns and opens and closes, for one or two minutes: the first three
+quarters are learned from, the rest is for the comparison that is printed. docs/adapting.md says what to expect.
+"""
+CHECKED = 500
+"""Frames of synthetic-test-v1 for what the network must not forget."""
+WORSE = 1.01
+"""From this factor of the error on them on, there is a warning."""
+ROWS = {'found': ('images with a hand, %', 100.0), 'error_mm': ('mean error, mm', 1.0),
+        'disagreement_mm': ('disagreement, mm', 1.0), 'jitter_mm': ('jitter, mm', 1.0),
+        'bone_drift_mm': ('bone drift, mm', 1.0), 'explained': ('depth explained, %', 100.0)}
+
+
+def add_parser(subparsers: Any) -> None:
+    """Declare the verb."""
+    parser = subparsers.add_parser(
+        'adapt', help='fine-tune a network to your camera, from a bag without labels',
+        description='Fine-tune a network to your camera, from a bag without labels, and compare it with the original '
+                    'on images that it did not learn from. Needs no ROS and no GPU; takes some minutes.',
+        epilog=_EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('bag', metavar='BAG', type=Path, help='one moving hand (ROS 1, sqlite3, MCAP)')
+    parser.add_argument('--out', type=Path, required=True, metavar='FILE', help='the new weights, .safetensors')
+    parser.add_argument('--model', help='weights to start from: a name or a checkpoint (the default weights)')
+    parser.add_argument('--side', default='auto', choices=('auto', 'left', 'right'),
+                        help='which hand it is (auto); say it if you can')
+    parser.add_argument('--steps', type=int, default=500, metavar='N', help='of training, 32 samples each (500)')
+    parser.add_argument('--ground-truth', metavar='G', help='only for the comparison: a topic of the bag with '
+                        'HandJointsArray, or an .npz file as for `hand-pose evaluate`')
+    parser.add_argument('--intrinsics', nargs=4, type=float, metavar=('FX', 'FY', 'CX', 'CY'),
+                        help='of the camera in pixels; needed for bags without camera_info')
+    parser.add_argument('--depth-scale', type=float, metavar='M', help='metres per depth unit (0.001)')
+    parser.add_argument('--depth-topic', metavar='TOPIC', help='needed if several topics carry depth')
+    parser.add_argument('--camera-info-topic', metavar='TOPIC', help='if not camera_info beside the depth topic')
+    parser.set_defaults(parser=parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Adapt, compare, write the weights, and say whether they are better."""
+    if args.out.suffix != '.safetensors':
+        args.parser.error(f'--out {args.out}: the name must end in .safetensors')
+    if args.steps < 1:
+        args.parser.error(f'--steps {args.steps}: at least one')
+    _check_writable(args.out)  # now, not after minutes of work
+
+    import torch
+
+    from hand_pose_ros.datasets import open_dataset
+    from hand_pose_ros.datasets.memory import keep_freed_memory
+    from hand_pose_ros.datasets.shards import make_shard
+    from hand_pose_ros.evaluation.bag_evaluation import Settings
+    from hand_pose_ros.evaluation.tables import number, text_table
+    from hand_pose_ros.models.checkpoints import DEFAULT, load_checkpoint, save_checkpoint
+    from hand_pose_ros.runtime import make_engine
+    from hand_pose_ros.training.adapt import fine_tune, is_better, judge, label, look, require_hands
+    from hand_pose_ros.training.validation import estimate
+
+    keep_freed_memory()
+    checkpoint = load_checkpoint(args.model)
+    name = args.model or DEFAULT
+    _check_fits(checkpoint, name)
+    bag = {'depth_topic': args.depth_topic, 'camera_info_topic': args.camera_info_topic,
+           'intrinsics': args.intrinsics and tuple(args.intrinsics), 'depth_scale': args.depth_scale}
+
+    def evaluate(model: str | None, network: torch.nn.Module, what: str) -> tuple[Look, Engine, Numbers]:
+        found = look(args.bag, Settings(model, 'cpu', estimator={'side': args.side}, bag=bag,
+                                        ground_truth=args.ground_truth), _progress(f'{what}: images'))
+        engine = make_engine(network, 'cpu')
+        return found, engine, judge(found, engine, _progress(f'{what}: comparison'))
+
+    found, engine, before = evaluate(args.model, checkpoint.network, 'before')
+    require_hands(found, args.bag)
+    for note in found.result.notes:
+        print(f'NOTE: {note}', file=sys.stderr)
+    labelled = label(engine, *found.select(found.split()[0]), _progress('labels'))
+    synthetic = make_shard(open_dataset('synthetic', 'train'), 0, min(1024, 16 * args.steps))
+    network = fine_tune(checkpoint.network, labelled, synthetic, args.steps, _progress('training'))
+
+    metadata = {key: value for key, value in checkpoint.metadata.items() if key != 'validation'} | {
+        'name': args.out.stem, 'data': f'synthetic hands of this package, and unlabelled depth of {args.bag.name}'}
+    with tempfile.TemporaryDirectory() as folder:
+        trial = Path(folder) / args.out.name
+        save_checkpoint(trial, network, metadata)  # what is judged is what is written, rounded to half precision
+        network = load_checkpoint(trial).network
+        _, _, after = evaluate(str(trial), network, 'after')
+    test = [make_shard(open_dataset('synthetic', 'test'), 0, CHECKED)]
+    errors = [1000 * float((joints - truth).norm(dim=-1).mean()) for joints, truth in
+              (estimate(each, test, torch.device('cpu')) for each in (checkpoint.network, network))]
+    metadata['adapted'] = {'from': str(name), 'bag': args.bag.name, 'images': len(labelled['patch']),
+                           'steps': args.steps, 'before': before, 'after': after, 'synthetic_test_v1_mm': errors}
+    save_checkpoint(args.out, network, metadata)
+
+    rows: list[tuple[str, ...]] = [(title, number(before[key], 1, '', factor), number(after[key], 1, '', factor))
+            for key, (title, factor) in ROWS.items() if before[key] is not None]
+    rows.append((f'synthetic-test-v1, first {CHECKED} frames, mm', *(number(error, 1) for error in errors)))
+    print(f'\n{len(labelled["patch"])} images were learned from; held out were the last '
+          f'{int(found.split()[1].sum())} of {len(found.result.predictions)}.\n')
+    print(text_table(('', 'before', 'after'), rows))
+    print(f'\nWritten to {args.out}; use them with --model {args.out}.')
+    if errors[1] > WORSE * errors[0]:
+        print(f'WARNING: on synthetic-test-v1 the adapted weights are worse ({errors[0]:.1f} mm before, '
+              f'{errors[1]:.1f} mm after): for other hands and cameras use {name}.')
+    if not is_better(before, after):
+        print(f'The adapted weights are no better on the held-out images: keep {name}.')
+    elif before['error_mm'] is None:
+        print('The adapted weights agree better with themselves and with the depth on the held-out images. Whether '
+              'they are more accurate only labels could tell (--ground-truth): look at the pictures of '
+              '`hand-pose estimate --overlay` before and after.')
+    return 0
+
+
+def _check_writable(path: Path) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise HandPoseError(f'{path}: cannot be written ({error.strerror}): choose another place') from None
+    if path.is_dir() or not os.access(path.parent, os.W_OK):
+        raise HandPoseError(f'{path}: cannot be written: choose another place')
+
+
+def _check_fits(checkpoint: Checkpoint, name: str) -> None:
+    if checkpoint.metadata['skeleton'] != 'hand21':
+        raise HandPoseError(f"{name}: its joints are those of {checkpoint.metadata['skeleton']}, but only weights for "
+                            'hand21 can be adapted: the synthetic hands that keep it from forgetting have these joints')
+    if checkpoint.refiner is not None:
+        raise HandPoseError(f'{name}: it has a refiner, which knows the errors of the network as it is: adapt weights '
+                            'without one')
+
+
+def _progress(what: str) -> Progress:
+    from tqdm import tqdm
+    return lambda items, total: tqdm(items, what, total, disable=None)

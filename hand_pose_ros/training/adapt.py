@@ -1,0 +1,286 @@
+"""Fine-tuning to a camera of one's own, from a recording of a moving hand without labels.
+
+`look` takes crops of the hand out of a bag; by time, the first of them are learned from and the last ones judged on.
+`label` says where the joints are, better than one look of the network can: each crop is shown turned, moved and scaled
+in many ways (the literature calls it consistency, or test-time augmentation), and one hand is fitted through the means
+of the answers. `fine_tune` teaches that to the network, with as many synthetic hands in between, so that it forgets
+nothing.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from hand_pose_ros.bags import Frame
+from hand_pose_ros.datasets import Batch, joints_in_metres
+from hand_pose_ros.errors import HandPoseError
+from hand_pose_ros.estimator import HandEstimate
+from hand_pose_ros.evaluation.bag_evaluation import Progress, Settings, evaluate_bag
+from hand_pose_ros.evaluation.results import Result
+from hand_pose_ros.geometry import crop
+from hand_pose_ros.runtime import Engine
+from hand_pose_ros.scoring import explain
+from hand_pose_ros.skeleton import HAND21
+from hand_pose_ros.training.augmentation import Augmentation, augment
+from hand_pose_ros.training.fitting import fit_hand
+from hand_pose_ros.training.losses import Terms
+from hand_pose_ros.training.objectives import DenseObjective, PoseObjective
+from hand_pose_ros.training.optimizers import learning_rate, make_optimizer
+from hand_pose_ros.training.recipes import RECIPES
+
+LEAST = 20
+"""Fewer images to learn from, or to judge on, say nothing."""
+MOST = 1500
+"""Of a longer recording, images are left out evenly."""
+HELD_OUT, GAP, GAP_S = 0.25, 0.05, 1.0
+"""The last part of the time is held out; before it, this part of the time, or this many seconds, is not used at all:
+neighbouring images are alike."""
+VIEWS = 12
+VARIETY = Augmentation(rotation_deg=180, jitter=0.008, scale=1.2)
+"""How a crop is shown to the network for its label."""
+AGREED_M = 0.012
+"""Answers that differ from their mean by more, on the average of the joints, are no label."""
+STEADY_M, STEADY_ROWS = 0.04, 4
+"""A hand that is this far from where it mostly is in the images around has been taken for something else."""
+BATCH = 16
+"""Recorded samples in a batch, and as many synthetic ones."""
+RATE = 3e-4
+
+
+Numbers = dict[str, float | None]
+"""By name; None = not known. See `judge`."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """What the estimator found in a bag.
+
+    Attributes:
+        result: joints of every image, NaN where there is no hand, and the truth if there is one.
+        rows: (N,) int64, the images that the crops are of, ascending.
+        crops: as the network sees them; their joints are the estimates. Patches are float16.
+    """
+
+    result: Result
+    rows: Tensor
+    crops: Batch
+
+    def select(self, chosen: NDArray[np.bool_] | Tensor) -> tuple[Tensor, Batch]:
+        """Rows and crops of those images (of all, bool) that have a crop, at most `MOST`, patches as float32."""
+        index = torch.as_tensor(chosen)[self.rows].nonzero()[:, 0]
+        index = index[torch.linspace(0, len(index) - 1, min(len(index), MOST)).round().long()]
+        crops = {key: value[index] for key, value in self.crops.items()}
+        return self.rows[index], {**crops, 'patch': crops['patch'].float()}
+
+    def split(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """The images to learn from and those to judge on, (images,) bool each, by time."""
+        assert self.result.stamps_ns is not None
+        time = (self.result.stamps_ns - self.result.stamps_ns.min()) / 1e9
+        end = float(time.max()) * (1 - HELD_OUT)
+        return time < end - min(GAP_S, GAP * float(time.max())), time >= end
+
+
+class _Crops:
+    """Keeps the crop of the first hand of each image, mirrored if it is a left one."""
+
+    def __init__(self) -> None:
+        self._images = 0
+        self.samples: list[tuple[Any, ...]] = []
+
+    def __enter__(self) -> _Crops:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def add(self, image: Frame, hands: Sequence[HandEstimate]) -> None:
+        for hand in hands[:1]:
+            patch, center = crop(image.depth, hand.cube, image.intrinsics), hand.cube.center
+            joints = hand.cube.to_cube(hand.joints)
+            if hand.side == 'left':
+                patch, joints, center = patch[..., ::-1], joints * (-1, 1, 1), (-center[0], *center[1:])
+            self.samples.append((self._images, hand.side, patch.astype(np.float16), joints, center, hand.cube.side))
+        self._images += 1
+
+    def batch(self) -> tuple[Tensor, Batch]:
+        """Rows and crops; where the hand was once taken for one of the other side, there is none."""
+        sides = [side for _, side, *_ in self.samples]
+        samples = [sample for sample in self.samples if sample[1] == max(set(sides), key=sides.count)]
+        rows, _, patches, joints, centers, lengths = zip(*samples, strict=True) if samples else [()] * 6
+        return torch.tensor(rows, dtype=torch.int64), {
+            'patch': torch.from_numpy(np.array(patches, np.float16)),
+            'joints': torch.from_numpy(np.array(joints, np.float32)),
+            'cube_center': torch.tensor(centers, dtype=torch.float32),
+            'cube_side': torch.tensor(lengths, dtype=torch.float32),
+            'hand_present': torch.ones(len(samples), dtype=torch.bool)}
+
+
+def look(bag: str | Path, settings: Settings, progress: Progress) -> Look:
+    """Run the estimator over a bag.
+
+    Raises:
+        HandPoseError: bag, camera, truth or weights cannot be used.
+    """
+    crops = _Crops()
+    result = evaluate_bag(bag, settings, progress, lambda *_: crops)
+    return Look(result, *crops.batch())
+
+
+def require_hands(found: Look, bag: str | Path) -> None:
+    """Make sure that there is enough to learn from and to judge on.
+
+    Raises:
+        HandPoseError: there is not.
+    """
+    for part, name in zip(found.split(), ('learn from', 'judge on'), strict=True):
+        if (count := int(torch.as_tensor(part)[found.rows].sum())) < LEAST:
+            raise HandPoseError(f'{bag}: a hand was found in {count} of the {int(part.sum())} images to {name}, and '
+                                f'{LEAST} are needed: record one hand that moves before the camera for a minute or two')
+
+
+def consensus(predict: Callable[[NDArray[np.float32]], NDArray[np.float32]], crops: Batch,
+              progress: Progress) -> tuple[Tensor, Tensor]:
+    """What a network says of each crop in many ways of showing it.
+
+    Args:
+        predict: patches (N, 1, 128, 128) -> joints (N, J, 3) in cube units.
+
+    Returns:
+        Mean joints (N, J, 3) in cube units of the crops, and how far the answers are from it on average, (N, J) metres.
+    """
+    count = len(crops['patch'])
+    # Augmentation maps points affinely, so what it does with these four tells how to map answers back.
+    corners = torch.cat([torch.zeros(1, 3), torch.eye(3)]).expand(count, 4, 3)
+    answers = []
+    for view in progress(range(VIEWS), VIEWS):
+        parts = []
+        for rows in torch.arange(count).split(64):
+            samples = {key: crops[key][rows] for key in ('patch', 'cube_center', 'cube_side')}
+            shown = augment({**samples, 'joints': corners[rows]}, VARIETY, rows, seed=view)
+            origin, axes = shown['joints'][:, :1], shown['joints'][:, 1:] - shown['joints'][:, :1]
+            parts.append((torch.from_numpy(predict(shown['patch'].numpy())) - origin) @ torch.linalg.inv(axes))
+        answers.append(torch.cat(parts))
+    views = torch.stack(answers)
+    mean = views.mean(0)
+    return mean, (views - mean).norm(dim=-1).mean(0) * crops['cube_side'][:, None] / 2
+
+
+def label(engine: Engine, rows: Tensor, crops: Batch, progress: Progress) -> Batch:
+    """The crops that can be labelled, with labels as their joints.
+
+    Raises:
+        HandPoseError: there are too few.
+    """
+    joints, spread = consensus(lambda patches: engine.run_full(patches)['joints'], crops, progress)
+    cube = crops['cube_center'], crops['cube_side']
+    points = joints_in_metres(joints, *cube)
+    middle = points.mean(1)
+    around = [middle[(rows - row).abs() <= STEADY_ROWS].median(0).values for row in rows]
+    steady = (middle - torch.stack(around)).norm(dim=-1) <= STEADY_M
+    keep = steady & (spread.mean(1) <= AGREED_M)
+    if (count := int(keep.sum())) < LEAST:
+        raise HandPoseError(f'the network is sure of itself in only {count} of {len(rows)} images of the hand, and '
+                            f'{LEAST} are needed: record it nearer, with open fingers and nothing else in reach')
+    crops = {key: value[keep] for key, value in crops.items()}
+    trust = 1 / (1 + (spread[keep] / 0.008) ** 2)
+    fitted = fit_hand(points[keep], trust, rows[keep], _surface(crops))
+    return {**crops, 'joints': to_cube(fitted, crops['cube_center'], crops['cube_side'])}
+
+
+def _surface(crops: Batch, count: int = 64) -> Tensor:
+    """Some measured points of each crop, (N, count, 3) in metres; where there is nothing, points at the back face."""
+    depth = crops['patch'].flatten(1)
+    size = crops['patch'].shape[-1]
+    measured = ((depth < 1) & (depth > -1)).float() + 1e-9
+    at = torch.multinomial(measured, count, replacement=True, generator=torch.Generator().manual_seed(0))
+    column, row = at % size, at // size
+    points = torch.stack([(column + 0.5) * 2 / size - 1, (row + 0.5) * 2 / size - 1, depth.gather(1, at)], dim=-1)
+    return joints_in_metres(points, crops['cube_center'], crops['cube_side'])
+
+
+def to_cube(points: Tensor, center: Tensor, side: Tensor) -> Tensor:
+    """Points (N, J, 3) in metres -> cube units: the inverse of `joints_in_metres`."""
+    center = center[:, None]
+    plane = torch.cat([points[..., :2] * (center[..., 2:] / points[..., 2:]), points[..., 2:]], dim=-1)
+    return (plane - center) / (side / 2)[:, None, None]
+
+
+def fine_tune(network: nn.Module, recorded: Batch, synthetic: Batch, steps: int, progress: Progress) -> nn.Module:
+    """A copy of a network for the joints of hand21, trained on labelled crops and synthetic ones, half and half.
+
+    Of the crops it learns joints, and nothing else: labels that are its own say nothing about how far to trust it.
+    """
+    network = copy.deepcopy(network).requires_grad_(True).eval()  # norms keep their statistics: two sorts of samples
+    recipe = replace(RECIPES['modern'], learning_rate=RATE, warmup=0.1)
+    kind = DenseObjective if hasattr(network, 'forward_full') else PoseObjective
+    objective = kind(network, recipe, HAND21).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    optimizer = make_optimizer(recipe, network)
+    order = torch.Generator().manual_seed(recipe.seed)
+    for step in progress(range(steps), steps):
+        for group in optimizer.param_groups:
+            group['lr'] = learning_rate(recipe, step / steps)
+        numbers = torch.arange(step * BATCH, (step + 1) * BATCH)
+        terms: list[Terms] = []
+        for samples, mirror in ((recorded, 0.0), (synthetic, recipe.augmentation.mirror)):
+            rows = torch.randint(len(samples['patch']), (BATCH,), generator=order)
+            batch = {key: value[rows] for key, value in samples.items()}
+            batch['patch'] = batch['patch'].float()
+            batch = augment(batch, replace(recipe.augmentation, mirror=mirror), numbers, seed=len(terms))
+            terms.append(objective(batch))
+        learned = [terms[0][name] for name in ('joints', 'maps') if name in terms[0]]
+        loss = torch.stack([*learned, *terms[1].values()]).sum()
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        optimizer.step()
+    return network.requires_grad_(False).to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
+
+
+def judge(found: Look, engine: Engine, progress: Progress) -> Numbers:
+    """Numbers of the held-out images.
+
+    found: share with a hand. error_mm: mean, where the truth is known. disagreement_mm: of the answers to one crop in
+    many ways. jitter_mm, bone_drift_mm: see `metrics`. explained: share of the depth that the joints explain, see
+    `scoring.explain`.
+    """
+    held = found.split()[1]
+    _, crops = found.select(held)
+    own: Numbers = {'disagreement_mm': None, 'explained': None}
+    if len(crops['patch']):
+        _, spread = consensus(lambda patches: engine.run_full(patches)['joints'], crops, progress)
+        scores = [explain(patch, joints, float(side), HAND21)[1] for patch, joints, side in
+                  zip(crops['patch'].numpy(), crops['joints'].numpy(), crops['cube_side'], strict=True)]
+        own = {'disagreement_mm': 1000 * float(spread.mean()), 'explained': float(np.mean(scores))}
+    whole = found.result
+    assert whole.stamps_ns is not None
+    part = replace(whole, predictions=whole.predictions[held], stamps_ns=whole.stamps_ns[held], seconds={}, info={},
+                   truth=None if whole.truth is None else whole.truth[held]).summary()
+    return {'found': part['detection_rate'], 'error_mm': part.get('mean_mm'), **own,
+            'jitter_mm': part['jitter_mm'], 'bone_drift_mm': part['bone_drift_mm']}
+
+
+def is_better(before: Numbers, after: Numbers) -> bool:
+    """Whether numbers of `judge` speak for the adapted weights.
+
+    The truth decides where it is known. Else the answers must agree better and explain the depth no worse: agreement
+    alone is what is trained, and would come from a network that always says the same.
+    """
+    def error(name: str) -> bool:
+        """Whether it is smaller than it was."""
+        now, was = after[name], before[name]
+        return now is not None and was is not None and now < was
+
+    def share(name: str, slack: float) -> bool:
+        return (after[name] or 0) >= (before[name] or 0) - slack
+
+    if before['error_mm'] is not None:
+        return share('found', 0.01) and error('error_mm')
+    return share('found', 0.01) and error('disagreement_mm') and share('explained', 0.005)

@@ -21,8 +21,8 @@ DEPTH_ENCODINGS: dict[str, np.dtype[Any]] = {
     '16UC1': np.dtype('u2'), 'mono16': np.dtype('u2'), '32FC1': np.dtype('f4')}
 """The encodings that hold depth, and the type of one pixel."""
 
-MAX_PIXELS = 1 << 24
-"""Far above any depth camera: a compressed image that claims more is corrupt and gets no memory."""
+MAX_PIXELS, MAX_SIDE = 1 << 24, 1 << 13
+"""Far above any depth camera: an image that claims more is corrupt and gets neither memory nor, long and thin, time."""
 
 _PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
 _HEADER = struct.Struct('<iff')  # compressedDepth: kind of quantisation and its parameters A and B
@@ -38,7 +38,8 @@ def decode_image(msg: Any, depth_scale: float = 0.001, *, source: str = '') -> N
         source: the topic or file, to begin error messages with.
 
     Raises:
-        InputError: not a depth encoding, an empty image, rows shorter than the width, or less data than rows.
+        InputError: not a depth encoding, an image that is empty or larger than any, rows shorter than the width, or
+            less data than rows.
     """
     with naming(source):
         height, width, step = int(msg.height), int(msg.width), int(msg.step)
@@ -55,6 +56,7 @@ def decode_image(msg: Any, depth_scale: float = 0.001, *, source: str = '') -> N
         if data.nbytes < step * height:
             raise InputError(f'{data.nbytes} bytes of data are fewer than step x height = {step} x {height}: '
                              'the image was cut short; check the publisher or the recording')
+        _check_size(width, height)
         pixels: NDArray[Any] = np.ndarray((height, width), pixel, data, strides=(step, pixel.itemsize))
         return to_metres(pixels, depth_scale) if pixel.kind == 'u' else _sanitised(pixels)
 
@@ -233,8 +235,8 @@ def _decode_png(data: memoryview) -> NDArray[np.uint16]:
 
 
 def _check_size(width: int, height: int) -> None:
-    if not 0 < width * height <= MAX_PIXELS:
-        raise InputError(f'the compressed image claims {width}x{height} pixels, which cannot be: '
+    if not 0 < width * height <= MAX_PIXELS or max(width, height) > MAX_SIDE:
+        raise InputError(f'the image claims {width}x{height} pixels, which cannot be: '
                          'the data is corrupt or of another format')
 
 

@@ -173,6 +173,17 @@ def test_a_png_that_claims_a_huge_size_gets_no_memory(units):
         decode_compressed(compressed('16UC1; compressedDepth png', bytes(png)))
 
 
+@pytest.mark.parametrize('pixels', [np.zeros((1 << 13 | 1, 1), np.uint16), np.zeros((1, 1 << 13 | 1), np.uint16)])
+def test_a_long_thin_image_is_refused_before_it_takes_minutes(pixels):
+    """Found by fuzzing: the search for a hand thins out columns, and there was one of 16 million pixels."""
+    size = f'claims {pixels.shape[1]}x{pixels.shape[0]} pixels'
+    with pytest.raises(InputError, match=size):
+        decode_image(image(pixels))
+    for codec, payload in (('png', encode_png(pixels)), ('rvl', encode_rvl(pixels))):
+        with pytest.raises(InputError, match=size):
+            decode_compressed(compressed(f'16UC1; compressedDepth {codec}', payload))
+
+
 @pytest.mark.parametrize('keep', [0.1, 0.5, 0.99])
 @pytest.mark.parametrize('codec', ['png', 'rvl'])
 def test_a_compressed_image_that_was_cut_short_never_gives_depth(units, codec, keep):

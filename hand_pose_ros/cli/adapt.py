@@ -113,8 +113,9 @@ def run(args: argparse.Namespace) -> int:
                            'steps': args.steps, 'before': before, 'after': after, 'synthetic_test_v1_mm': errors}
     save_checkpoint(args.out, network, metadata)
 
-    rows: list[tuple[str, ...]] = [(title, number(before[key], 1, '', factor), number(after[key], 1, '', factor))
-            for key, (title, factor) in ROWS.items() if before[key] is not None]
+    rows: list[tuple[str, ...]] = [
+        (title, number(before[key], 1, '', factor), number(after[key], 1, '', factor))
+        for key, (title, factor) in ROWS.items() if before[key] is not None]
     rows.append((f'synthetic-test-v1, first {CHECKED} frames, mm', *(number(error, 1) for error in errors)))
     print(f'\n{len(labelled["patch"])} images were learned from; held out were the last '
           f'{int(found.split()[1].sum())} of {len(found.result.predictions)}.\n')

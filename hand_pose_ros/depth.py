@@ -225,8 +225,12 @@ def _decode_png(data: memoryview) -> NDArray[np.uint16]:
         raise InputError(f'the PNG has {bits} bits per {"colour" if color else "grey value"}, which is not '
                          'metric depth: record 16-bit greyscale (one channel)')
     _check_size(width, height)
+    end, kind = 8, b''
+    while end + 8 <= len(data) and kind != b'IEND':  # OpenCV makes room for a chunk of whatever length it claims
+        length, kind = struct.unpack_from('>I4s', data, end)
+        end += length + 12
     try:
-        units = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        units = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if end <= len(data) else None
     except cv2.error:
         units = None
     if units is None or units.dtype != np.uint16 or units.shape != (height, width):

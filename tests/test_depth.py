@@ -173,6 +173,16 @@ def test_a_png_that_claims_a_huge_size_gets_no_memory(units):
         decode_compressed(compressed('16UC1; compressedDepth png', bytes(png)))
 
 
+def test_a_png_chunk_that_claims_a_huge_length_gets_no_memory(units, monkeypatch):
+    """Found by fuzzing: OpenCV takes 4 GB for it before it notices."""
+    png = bytearray(encode_png(units))
+    at = png.index(b'IDAT') - 4
+    png[at:at + 4] = b'\xf0\0\0\0'
+    monkeypatch.setattr(cv2, 'imdecode', pytest.fail)
+    with pytest.raises(InputError, match='damaged'):
+        decode_compressed(compressed('16UC1; compressedDepth png', bytes(png)))
+
+
 @pytest.mark.parametrize('pixels', [np.zeros((1 << 13 | 1, 1), np.uint16), np.zeros((1, 1 << 13 | 1), np.uint16)])
 def test_a_long_thin_image_is_refused_before_it_takes_minutes(pixels):
     """Found by fuzzing: the search for a hand thins out columns, and there was one of 16 million pixels."""

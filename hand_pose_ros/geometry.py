@@ -17,6 +17,9 @@ from hand_pose_ros.errors import InputError
 
 PATCH_SIZE = 128
 """Width and height of a patch in pixels (paper, section 3)."""
+MAX_SLOPE, MIN_SLOPE = 100.0, 1e-4
+"""Of the rays at the border of an image against the axis of the camera (89.4 degrees, and a fraction of a minute of
+arc). Beyond them the intrinsics are those of no lens."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,14 @@ class Intrinsics:
             raise InputError(
                 f'the depth image has {width}x{height} pixels but its camera_info is for {self.width}x{self.height}: '
                 'use the camera_info that is published beside this very image')
+
+    def check_lens(self) -> None:
+        """Raise InputError if no lens can have these intrinsics: what is computed with them may be anything."""
+        for focal, center, size in ((self.fx, self.cx, self.width), (self.fy, self.cy, self.height)):
+            if max(abs(center), abs(size - center)) > MAX_SLOPE * focal or size < MIN_SLOPE * focal:
+                raise InputError(f'a focal length of {focal:g} and a principal point at {center:g} pixels are those of '
+                                 f'no camera of {self.width}x{self.height} pixels: calibrate it, or give the '
+                                 'intrinsics fx, fy, cx and cy yourself')
 
     def project(self, points: ArrayLike) -> NDArray[np.float64]:
         """Points (..., 3) in metres -> pixels (..., 2)."""

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -40,3 +41,12 @@ def test_listing_the_verbs_loads_no_heavy_library():
     code = ("import sys; from hand_pose_ros.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
             "assert not {'torch', 'cv2', 'rclpy', 'matplotlib'} & set(sys.modules)")
     subprocess.run([sys.executable, '-c', code], check=True, capture_output=True)
+
+
+@pytest.mark.skipif(sys.platform != 'linux', reason='elsewhere there is always a display')
+def test_to_view_without_a_display_is_refused_at_once(monkeypatch, capsys):
+    for name in ('DISPLAY', 'WAYLAND_DISPLAY'):
+        monkeypatch.delenv(name, raising=False)
+    bag = Path(__file__).parents[1] / 'demo' / 'hand.mcap'
+    assert main(['view', str(bag)]) == 1
+    assert '--save FILE.rrd' in capsys.readouterr().err

@@ -137,6 +137,14 @@ def test_intrinsics_of_no_lens_are_refused(k: list[float]) -> None:
         camera.intrinsics(640, 480, given_)
 
 
+def test_intrinsics_may_be_set_one_after_the_other() -> None:
+    camera = Camera('/camera_info')
+    with pytest.raises(InputError, match='go together'):
+        camera.intrinsics(640, 480, Params(intrinsics_fx=500.0))
+    both = Params(intrinsics_fx=500.0, intrinsics_fy=510.0, intrinsics_cx=320.0, intrinsics_cy=240.0)
+    assert camera.intrinsics(640, 480, both) == Intrinsics(500, 510, 320, 240, 640, 480)
+
+
 def test_depth_that_cannot_hold_a_hand_is_explained() -> None:
     far = np.full((48, 64), 4.0, np.float32)
     assert 'depth_scale' in depth_problem(far, 0.1, 1.5)
@@ -147,7 +155,7 @@ def test_depth_that_cannot_hold_a_hand_is_explained() -> None:
 
 @pytest.mark.parametrize('wrong, words', [
     ({'side': 'both'}, 'auto, left, right'), ({'device': 'gpu'}, 'cuda'), ({'min_depth': 2.0}, 'max_depth'),
-    ({'cube_size': 0.01}, '0.05'), ({'intrinsics_fx': 500.0}, 'intrinsics.fy'),
+    ({'cube_size': 0.01}, '0.05'),
     ({'transport': 'theora'}, 'compressedDepth')])
 def test_contradicting_parameters_are_refused(wrong: dict, words: str) -> None:
     with pytest.raises(HandPoseError, match=words):

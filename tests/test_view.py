@@ -77,6 +77,7 @@ def test_a_failure_leaves_no_file_and_is_one_sentence(tmp_path, bag, weights, ca
     assert main(['view', str(cut), '--model', str(weights), '--save', str(tmp_path / 'a.rrd')]) == 1
     assert 'cut.mcap' in capsys.readouterr().err
     monkeypatch.setitem(sys.modules, 'rerun', None)
+    monkeypatch.setenv('DISPLAY', ':0')
     assert main(['view', str(bag), '--model', str(weights)]) == 1
     assert 'rerun-sdk' in capsys.readouterr().err
     assert not list(tmp_path.glob('*.rrd*')) and not list(tmp_path.glob('.*rrd*'))

@@ -23,14 +23,15 @@ examples:
   hand-pose experiment networks --out results-nyu --set dataset=nyu --set root=/data/NYU --set epochs=20
 """
 
+NAMES = ('networks', 'bottleneck', 'refinement', 'joints', 'runtime', 'qualitative', 'ingredients')
+
 
 def add_parser(subparsers: Any) -> None:
     from hand_pose_ros.cli.train import add_machine_arguments
 
     parser = subparsers.add_parser('experiment', help='repeat an experiment of the paper', epilog=EPILOG,
                                    formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('name', metavar='NAME', choices=['networks', 'bottleneck', 'refinement', 'joints', 'runtime', 'qualitative',
-                                                 'ingredients'], help='see below')
+    parser.add_argument('name', choices=NAMES, metavar='NAME', help='see below')
     parser.add_argument('--out', type=Path, required=True, metavar='OUT', help='folder of results and trained networks')
     parser.add_argument('--recipe', default='paper', help='what all networks are trained by (default: %(default)s)')
     add_machine_arguments(parser)

@@ -97,16 +97,19 @@ class Scene:
         path: of the .rrd file, which is there when the scene is left without an error; None opens the viewer.
 
     Raises:
-        HandPoseError: Rerun is not installed, or the file cannot be written.
+        HandPoseError: Rerun is not installed, there is no display, or the file cannot be written.
     """
 
     def __init__(self, path: Path | None) -> None:
+        if path is None and sys.platform == 'linux' and not {'DISPLAY', 'WAYLAND_DISPLAY'} & os.environ.keys():
+            raise HandPoseError('there is no display for the viewer: write a file with --save FILE.rrd and open it '
+                                'where there is one, with rerun FILE.rrd')
         try:
             import rerun
             from rerun import blueprint
         except ImportError as error:
-            raise HandPoseError("hand-pose view needs Rerun: pip install 'hand_pose_ros[view]' (or rerun-sdk)"
-                                ) from error
+            raise HandPoseError(f"hand-pose view needs Rerun ({error}): pip install 'hand_pose_ros[view]' (or "
+                                'rerun-sdk)') from error
         self._rerun, self._path = rerun, path
         self._markers: HandMarkers | None = None
         views = blueprint.Horizontal(blueprint.Spatial3DView(origin='/', name='hands in 3D'), blueprint.Spatial2DView(

@@ -69,7 +69,7 @@ class Synthetic(Dataset):
 def _ingredients(variant: str) -> Ingredients | None:
     if not variant:
         return None
-    names = INGREDIENTS + ('everything',)
+    names = (*INGREDIENTS, 'everything')
     start, _, name = variant.partition('-')
     if start != 'without' or name not in names:
         raise DatasetError(f"synthetic:{variant}: write it as synthetic:without-NAME with one of {', '.join(names)}")

@@ -10,10 +10,6 @@ from hand_pose_ros.errors import InputError, naming
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.ros.params import Params
 
-MAX_SLOPE, MIN_SLOPE = 100.0, 1e-4
-"""Of the rays at the border of an image against the axis of the camera (89.4 degrees, and a fraction of a minute of
-arc). Beyond them the intrinsics are those of no lens, and what is computed with them may be anything."""
-
 
 class Camera:
     """Intrinsics from parameters or from the newest camera_info.
@@ -50,11 +46,13 @@ class Camera:
         Raises:
             InputError: there is none, it is not calibrated, it describes an image of another size, or no lens is so.
         """
-        if params.intrinsics_fx > 0:
+        if params.has_intrinsics:
+            if not min(params.intrinsics_fx, params.intrinsics_fy) > 0:
+                raise InputError('parameters intrinsics.fx and intrinsics.fy go together: set both, or neither')
             intrinsics = Intrinsics(params.intrinsics_fx, params.intrinsics_fy, params.intrinsics_cx,
                                     params.intrinsics_cy, width, height)
             with naming('parameters intrinsics.*'):
-                _check_lens(intrinsics)
+                intrinsics.check_lens()
             return intrinsics
         with self._changed:
             self._changed.wait_for(lambda: self._closed or self._fits(width, height, params.use_rectified),
@@ -66,19 +64,19 @@ class Camera:
         with naming(self.topic):
             intrinsics = Intrinsics.from_camera_info(info, rectified=params.use_rectified)
             intrinsics.check_size(width, height)
-            _check_lens(intrinsics)
+            intrinsics.check_lens()
         return intrinsics
 
     def source(self, params: Params) -> str:
         """Where the intrinsics come from."""
-        if params.intrinsics_fx > 0:
+        if params.has_intrinsics:
             return 'parameters'
         return self.topic if self._info is not None else f'none yet on {self.topic}'
 
     def frame_problem(self, frame_id: str, params: Params) -> str:
         """What is suspicious about the frame of an image, empty if nothing: another camera may have the same size."""
         info = self._info
-        if params.intrinsics_fx > 0 or info is None or info.header.frame_id in ('', frame_id):
+        if params.has_intrinsics or info is None or info.header.frame_id in ('', frame_id):
             return ''
         return (f'its frame_id is {frame_id!r:.80} but that of {self.topic} is {info.header.frame_id!r:.80}: if they '
                 'are different cameras, the joints are wrong; remap depth/camera_info to the one of the depth image')
@@ -91,12 +89,3 @@ class Camera:
         except InputError:
             return False
         return True
-
-
-def _check_lens(intrinsics: Intrinsics) -> None:
-    for focal, center, size in ((intrinsics.fx, intrinsics.cx, intrinsics.width),
-                                (intrinsics.fy, intrinsics.cy, intrinsics.height)):
-        if max(abs(center), abs(size - center)) > MAX_SLOPE * focal or size < MIN_SLOPE * focal:
-            raise InputError(f'a focal length of {focal:g} and a principal point at {center:g} pixels are those of no '
-                             f'camera of {intrinsics.width}x{intrinsics.height} pixels: calibrate it, or set the '
-                             'parameters intrinsics.fx, .fy, .cx and .cy')

@@ -97,8 +97,11 @@ class Params:
         if 0 < self.cube_size < 0.05:
             raise HandPoseError(f'parameter cube_size is {self.cube_size} m, smaller than any hand: give 0.05 to 1.0, '
                                 'or 0 for the size that the model was trained for')
-        if (self.intrinsics_fx > 0) != (self.intrinsics_fy > 0):
-            raise HandPoseError('parameters intrinsics.fx and intrinsics.fy go together: set both, or neither')
+
+    @property
+    def has_intrinsics(self) -> bool:
+        """Whether the user gives the intrinsics. `ros2 param set` can only give them one after the other."""
+        return max(self.intrinsics_fx, self.intrinsics_fy) > 0
 
     def make_estimator(self) -> HandPoseEstimator:
         """Load the network, ready to answer.

@@ -48,6 +48,7 @@ def main() -> None:
     parser.add_argument('--json', type=Path)
     parser.add_argument('--overlays', type=Path, help='write one sheet of all frames for each model here')
     parser.add_argument('--min-score', type=float, help='(that of the estimator)')
+    parser.add_argument('--sides-known', action='store_true', help='tell the estimator whether it is a left hand')
     args = parser.parse_args()
     frames = json.loads((args.frames / 'annotations.json').read_text())['frames']
     table: dict[str, dict[str, Any]] = {}
@@ -60,6 +61,7 @@ def main() -> None:
         for frame in frames:
             depth = read_png(args.frames / frame['file'], frame['depth_scale_m'])
             estimator.reset()
+            estimator.side = frame['side'] if args.sides_known else 'auto'
             hands = estimator(depth, camera_of(frame))
             hand = hands[0] if hands else None
             errors.setdefault(frame['sensor'], []).extend(tip_errors_mm(frame, hand).values())

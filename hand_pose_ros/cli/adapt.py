@@ -47,7 +47,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('--model', help='weights to start from: a name or a checkpoint (the default weights)')
     parser.add_argument('--side', default='auto', choices=('auto', 'left', 'right'),
                         help='which hand it is (auto); say it if you can')
-    parser.add_argument('--steps', type=int, default=500, metavar='N', help='of training, 32 samples each (500)')
+    parser.add_argument('--steps', type=int, default=300, metavar='N', help='of training, 32 samples each (300)')
     parser.add_argument('--ground-truth', metavar='G', help='only for the comparison: a topic of the bag with '
                         'HandJointsArray, or an .npz file as for `hand-pose evaluate`')
     parser.add_argument('--intrinsics', nargs=4, type=float, metavar=('FX', 'FY', 'CX', 'CY'),

@@ -110,8 +110,10 @@ def test_two_pixels_at_a_time_give_the_same(channels, kernel, pool, size):
 
 
 @pytest.mark.parametrize('block', [
-    [nn.Conv2d(1, 12, 3), nn.MaxPool2d(2)], [nn.Conv2d(1, 8, 3), nn.MaxPool2d(3)], [nn.Conv2d(1, 8, 3), nn.ReLU()],
-    [nn.Conv2d(1, 8, 3, padding=1), nn.MaxPool2d(2)], [nn.Conv2d(2, 8, 3, groups=2), nn.MaxPool2d(2)]])
+    [nn.Conv2d(1, 12, 3), nn.MaxPool2d(2), nn.ReLU()], [nn.Conv2d(1, 8, 3), nn.MaxPool2d(3), nn.ReLU()],
+    [nn.Conv2d(1, 8, 3), nn.ReLU()], [nn.Conv2d(1, 8, 3), nn.MaxPool2d(2)],
+    [nn.Conv2d(1, 8, 3, padding=1), nn.MaxPool2d(2), nn.ReLU()],
+    [nn.Conv2d(2, 8, 3, groups=2), nn.MaxPool2d(2), nn.ReLU()]])
 def test_what_would_not_gain_or_not_be_equal_stays(block):
     network = nn.Sequential(*block)
     fill_lanes(network)

@@ -28,7 +28,9 @@ class Pipeline(nn.Module):
         answer: dict[str, Tensor] = {'joints': self.network(patches)} if full is None else full(patches)
         if self.refiner is not None:
             answer['joints'] = self.refiner(patches, answer['joints'])
-        return tuple(answer[name].float() for name in self.outputs)
+        # Where nothing is to be cast, the exported graph shall not try to.
+        return tuple(value if value.dtype == torch.float32 else value.float()
+                     for value in (answer[name] for name in self.outputs))
 
 
 class Engine(ABC):

@@ -10,7 +10,7 @@ LANES = 16
 
 
 class PairedConvolution(nn.Module):
-    """A valid convolution for at most LANES / 2 channels, and max pooling of even width, for two pixels at a time.
+    """A valid convolution for at most LANES / 2 channels, ReLU, and max pooling of even width, two pixels at a time.
 
     With 8 channels half of the lanes would stay idle. A filter that is one pixel wider, once with its weights to the
     left and once to the right, gives two neighbouring pixels as 16 channels, whose maximum the pooling takes at last.
@@ -20,6 +20,7 @@ class PairedConvolution(nn.Module):
     def __init__(self, convolution: nn.Conv2d, pool: int) -> None:
         super().__init__()
         channels, _, height, width = convolution.weight.shape
+        self.channels = channels
         self.pair = nn.Conv2d(convolution.in_channels, 2 * channels, (height, width + 1), stride=(1, 2))
         self.pool = nn.MaxPool2d((pool, pool // 2))
         with torch.no_grad():
@@ -30,22 +31,22 @@ class PairedConvolution(nn.Module):
                 self.pair.bias.copy_(convolution.bias.repeat(2))
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, H, W) -> what pooling the convolution would give."""
-        left, right = self.pool(self.pair(x)).chunk(2, dim=1)
-        return torch.maximum(left, right)
+        """(B, C, H, W) -> what convolution, pooling and ReLU would give; in this order ReLU costs nothing."""
+        pooled = self.pool(torch.relu(self.pair(x)))
+        return torch.maximum(pooled[:, :self.channels], pooled[:, self.channels:])
 
 
 def fill_lanes(module: nn.Module) -> None:
-    """Replace, wherever they follow each other in a Sequential, small convolutions and their pooling by pairs."""
+    """Replace every Sequential of a small convolution, its pooling and ReLU by pairs."""
     for each in module.modules():
-        if not isinstance(each, nn.Sequential) or len(each) < 2:
+        if not isinstance(each, nn.Sequential) or len(each) != 3:
             continue
-        convolution, pool = each[0], each[1]
-        if not isinstance(convolution, nn.Conv2d) or not isinstance(pool, nn.MaxPool2d):
+        convolution, pool, relu = each
+        if not (isinstance(convolution, nn.Conv2d) and isinstance(pool, nn.MaxPool2d) and isinstance(relu, nn.ReLU)):
             continue
         size = pool.kernel_size
         if isinstance(size, int) and size % 2 == 0 and _is_plain(convolution, pool):
-            each[0], each[1] = PairedConvolution(convolution, size), nn.Identity()
+            each[0], each[1], each[2] = PairedConvolution(convolution, size), nn.Identity(), nn.Identity()
 
 
 def _is_plain(convolution: nn.Conv2d, pool: nn.MaxPool2d) -> bool:

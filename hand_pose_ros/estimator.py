@@ -6,7 +6,6 @@ next one need not be searched.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -35,7 +34,7 @@ LOOKS = 3
 """How often at most: on synthetic images two looks find a hand more often than one, and three more often than two."""
 FALSE_ALARMS = 3
 """After so many objects that are no hand, the search is given up until the next image."""
-SEARCH_EVERY = 10
+SEARCH_EVERY = 5
 """While a hand is tracked, every so many images are worth a look at one more object: to search costs several times as
 much as to track."""
 FRAME_S = 1 / 30
@@ -219,7 +218,7 @@ class HandPoseEstimator:
                 break
             if _overlaps(found, hands, self._dismissed):
                 continue
-            track = _Track(id='', center=found.center, rightness=self._other_side() if hands else 0.0)
+            track = _Track(id='', center=found.center)
             reading = self._read(depth, intrinsics, found, track)
             # Where there is a hand, a face or an elbow beside it often scores min_score, hardly ever its square root.
             enough = max(self.min_score, 0) ** 0.5 if hands else self.min_score
@@ -230,12 +229,6 @@ class HandPoseEstimator:
             track.id = f'hand_{next(self._ids)}'
             self._tracks.append(track)
             hands.append(self._follow(track, reading, dt))
-
-    def _other_side(self) -> float:
-        """Beside a hand of a settled side the other one is expected, until it is doubted for the first time: that
-        halves the price of a look."""
-        first = self._tracks[0].rightness
-        return math.copysign(SETTLED + 1, -first) if abs(first) > SETTLED else 0.0
 
     def _read(self, depth: NDArray[np.float32], intrinsics: Intrinsics, cube: Cube, track: _Track) -> _Reading:
         """Look into a cube, and again where its joints are: from an arm that was found first, to the hand."""

@@ -56,7 +56,7 @@ class Params:
     cube_size: float = _parameter(0.0, 'Side of the cube around a hand; 0 = what the model was trained for.',
                                   low=0.0, high=1.0)
     side: str = _parameter('auto', 'Which hands there are; auto finds out.', choices=('auto', 'left', 'right'))
-    max_hands: int = _parameter(2, 'At most this many hands per image. While there are fewer, every tenth image takes '
+    max_hands: int = _parameter(2, 'At most this many hands per image. While there are fewer, every fifth image takes '
                                 'longer, for it is searched for more.', low=1, high=8)
     min_score: float = _parameter(0.4, 'Hands with a lower score are not reported.', low=0.0, high=1.0)
     detector: str = _parameter('nearest', 'Where new hands are looked for: at what is nearest to the camera, or within '

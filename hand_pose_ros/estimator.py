@@ -37,6 +37,8 @@ FALSE_ALARMS = 3
 SEARCH_EVERY = 5
 """While a hand is tracked, every so many images are worth a look at one more object: to search costs several times as
 much as to track."""
+HOPELESS = 0.1
+"""Beside a hand, an object that scores less at first sight gets no second look: it would cost the next image."""
 FRAME_S = 1 / 30
 """Time between images for smoothing, where the caller does not say."""
 SIDE_MEMORY = 0.9
@@ -219,7 +221,7 @@ class HandPoseEstimator:
             if _overlaps(found, hands, self._dismissed):
                 continue
             track = _Track(id='', center=found.center)
-            reading = self._read(depth, intrinsics, found, track)
+            reading = self._read(depth, intrinsics, found, track, HOPELESS if hands else 0.0)
             # Where there is a hand, a face or an elbow beside it often scores min_score, hardly ever its square root.
             enough = max(self.min_score, 0) ** 0.5 if hands else self.min_score
             if reading.score < enough or _overlaps(reading.cube, hands):
@@ -229,13 +231,19 @@ class HandPoseEstimator:
             track.id = f'hand_{next(self._ids)}'
             self._tracks.append(track)
             hands.append(self._follow(track, reading, dt))
+            alarms = min(alarms, 1)
 
-    def _read(self, depth: NDArray[np.float32], intrinsics: Intrinsics, cube: Cube, track: _Track) -> _Reading:
-        """Look into a cube, and again where its joints are: from an arm that was found first, to the hand."""
+    def _read(self, depth: NDArray[np.float32], intrinsics: Intrinsics, cube: Cube, track: _Track,
+              hopeless: float = 0.0) -> _Reading:
+        """Look into a cube, and again where its joints are: from an arm that was found first, to the hand.
+
+        What scores less than `hopeless` is not looked at again.
+        """
         reading = self._predict(depth, intrinsics, cube, track)
         for _ in range(LOOKS - 1):
             center = reading.joints.mean(axis=0)
-            if np.linalg.norm(center - reading.cube.center) <= RECENTER_M or center[2] <= self.near:
+            if (np.linalg.norm(center - reading.cube.center) <= RECENTER_M or center[2] <= self.near
+                    or reading.score < hopeless):
                 break
             reading = self._predict(depth, intrinsics, Cube(tuple(center.tolist()), cube.side), track)
         return reading

@@ -2,6 +2,7 @@
 
     python benchmarks/node_latency.py --json node_latency.json
     python benchmarks/node_latency.py --rates 30 60 90 --seconds 60 --profiles both --reliability best_effort
+    python benchmarks/node_latency.py --parameters side:=right
 
 Each row is one setting: the rate, the reliability that the camera offers, and which of the two processes has the Fast
 DDS profile for large images. `lost` images were published and never answered. `node` says where the time goes inside
@@ -46,7 +47,7 @@ def main() -> int:
     parser.add_argument('--reliability', nargs='+', default=['best_effort', 'reliable'],
                         choices=['best_effort', 'reliable'])
     parser.add_argument('--profiles', nargs='+', default=list(PROFILES), choices=list(PROFILES))
-    parser.add_argument('--model', default='', help='name of weights that ship, or a checkpoint (the default weights)')
+    parser.add_argument('--parameters', nargs='+', default=[], metavar='NAME:=VALUE', help='of the node')
     parser.add_argument('--one', help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.one:
@@ -56,7 +57,7 @@ def main() -> int:
     print(f'{"setting":<40}{"sent":>6}{"lost":>6}{"p50 ms":>9}{"p99 ms":>9}  in the node')
     for rate, reliability, profile in itertools.product(args.rates, args.reliability, args.profiles):
         camera_has, node_has = PROFILES[profile]
-        setting = {'rate': rate, 'seconds': args.seconds, 'reliability': reliability, 'model': args.model,
+        setting = {'rate': rate, 'seconds': args.seconds, 'reliability': reliability, 'parameters': args.parameters,
                    'node_has_profile': node_has}
         done = subprocess.run([sys.executable, __file__, '--one', json.dumps(setting)], env=environment(camera_has),
                               stdout=subprocess.PIPE, text=True, check=True)
@@ -89,7 +90,8 @@ def hand_image() -> np.ndarray:
     return np.where(mask > 0, 600, 2500).astype(np.uint16)
 
 
-def measure(rate: float, seconds: float, reliability: str, model: str, node_has_profile: bool) -> dict[str, Any]:
+def measure(rate: float, seconds: float, reliability: str, parameters: list[str],
+            node_has_profile: bool) -> dict[str, Any]:
     """One setting: this process is the camera and the listener."""
     import rclpy
     from diagnostic_msgs.msg import DiagnosticArray
@@ -122,7 +124,7 @@ def measure(rate: float, seconds: float, reliability: str, model: str, node_has_
     thread = threading.Thread(target=executor.spin, daemon=True)
     thread.start()
 
-    arguments = ['-p', 'min_score:=0.0'] + (['-p', f'model:={model}'] if model else [])
+    arguments = [item for each in ('min_score:=0.0', *parameters) for item in ('-p', each)]
     process = subprocess.Popen([*COMMAND, 'estimator', '--ros-args', *arguments], env=environment(node_has_profile))
     try:
         while not (images.get_subscription_count() and node.count_publishers('hand/joints')):

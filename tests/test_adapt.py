@@ -17,6 +17,7 @@ from hand_pose_ros.geometry import Cube, Intrinsics
 from hand_pose_ros.models import build
 from hand_pose_ros.models.checkpoints import WEIGHTS, load_checkpoint, save_checkpoint
 from hand_pose_ros.skeleton import HAND21
+from hand_pose_ros.synthetic.crops import to_cube
 from hand_pose_ros.synthetic.generator import SyntheticHands
 from hand_pose_ros.synthetic.hand import HandModel
 from hand_pose_ros.synthetic.kinematics import INDEX
@@ -24,7 +25,7 @@ from hand_pose_ros.synthetic.rng import Random
 from hand_pose_ros.synthetic.shapes import sample_shapes
 from hand_pose_ros.synthetic.stages import Ingredients
 from hand_pose_ros.training import adapt, fitting
-from hand_pose_ros.training.adapt import consensus, fine_tune, is_better, to_cube
+from hand_pose_ros.training.adapt import consensus, fine_tune, is_better
 from hand_pose_ros.training.fitting import fit_hand
 
 pytestmark = pytest.mark.usefixtures('one_thread')

@@ -11,7 +11,7 @@ import re
 import resource
 import struct
 from array import array
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -146,6 +146,18 @@ def assert_clean(depth: np.ndarray) -> None:
     assert np.isfinite(depth).all() and (depth >= 0).all()
 
 
+def decoded_or_explained(decode: Callable[..., np.ndarray], message: Any) -> np.ndarray | None:
+    try:
+        depth = decode(message, source=TOPIC)
+    except InputError as error:
+        assert is_explained(str(error), TOPIC)
+        event('refused')
+        return None
+    event('decoded')
+    assert_clean(depth)
+    return depth
+
+
 @pytest.fixture
 def limited_memory() -> Iterator[None]:
     """Not a limit of the system: OpenCV would report that as a damaged image, and hide who asked for so much."""
@@ -157,15 +169,10 @@ def limited_memory() -> Iterator[None]:
 @FUZZ
 @given(message=images())
 def test_images(limited_memory: None, message: Image) -> None:
-    try:
-        depth = decode_image(message, source=TOPIC)
-    except InputError as error:
-        assert is_explained(str(error), TOPIC)
-        event('refused')
+    depth = decoded_or_explained(decode_image, message)
+    if depth is None:
         return
-    event('decoded')
     assert depth.shape == (message.height, message.width)
-    assert_clean(depth)
     kind = ('>' if message.is_bigendian else '<') + ('f' if message.encoding == '32FC1' else 'H')
     for v, u in ((0, 0), (message.height // 2, message.width // 2), (message.height - 1, message.width - 1)):
         [value] = struct.unpack_from(kind, message.data, v * message.step + u * struct.calcsize(kind))
@@ -176,14 +183,9 @@ def test_images(limited_memory: None, message: Image) -> None:
 @FUZZ
 @given(message=compressed_images())
 def test_compressed_images(limited_memory: None, message: CompressedImage) -> None:
-    try:
-        depth = decode_compressed(message, source=TOPIC)
-    except InputError as error:
-        assert is_explained(str(error), TOPIC)
-        event('refused')
+    depth = decoded_or_explained(decode_compressed, message)
+    if depth is None:
         return
-    event('decoded')
-    assert_clean(depth)
     data = bytes(message.data)
     start = 0 if data[:8] == b'\x89PNG\r\n\x1a\n' else 12
     rvl = 'rvl' in message.format.replace(';', ' ').split()

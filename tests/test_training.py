@@ -15,6 +15,7 @@ import torch
 from safetensors.torch import load_file
 
 from hand_pose_ros.cli import main
+from hand_pose_ros.cli.experiment import NAMES
 from hand_pose_ros.datasets import Batch, Dataset, icvl, joints_in_metres
 from hand_pose_ros.datasets.shards import MemoryShards
 from hand_pose_ros.errors import HandPoseError
@@ -453,6 +454,7 @@ def test_the_heads_of_a_dense_network_are_trained_for_what_they_say():
 
 @pytest.mark.timeout(600)
 def test_experiments_train_what_is_missing_and_write_table_plot_and_json(folder, tmp_path, monkeypatch):
+    assert tuple(experiments.EXPERIMENTS) == NAMES
     monkeypatch.setattr(experiments, 'WIDTHS', (None, 8, 30))
     monkeypatch.setattr(experiments, 'ITERATIONS', 2)
     monkeypatch.setattr(experiments, 'ROUNDS', 1)

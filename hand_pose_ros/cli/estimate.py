@@ -60,8 +60,8 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('--side', default='auto', choices=('auto', 'left', 'right'), help='which hand it is (auto)')
     parser.add_argument('--cube-size', type=float, metavar='M', help='side of the cube around a hand, metres')
     parser.add_argument('--max-hands', type=int, default=2, metavar='N', help='at most N hands per image (2)')
-    parser.add_argument('--min-score', type=float, default=0.3, metavar='S',
-                        help='leave out hands below this score (0.3)')
+    parser.add_argument('--min-score', type=float, default=0.4, metavar='S',
+                        help='leave out hands below this score (0.4)')
     parser.add_argument('--out', type=Path, metavar='FILE', help='.npz or .mcap')
     parser.add_argument('--overlay', type=Path, metavar='FOLDER', help='a picture of every image with its joints')
     parser.set_defaults(parser=parser)

@@ -48,7 +48,7 @@ def add_parser(subparsers: Any) -> None:
     bag.add_argument('--model', help='name of weights that ship, or a checkpoint (the default weights)')
     bag.add_argument('--side', default='auto', choices=('auto', 'left', 'right'), help='which hand it is (auto)')
     bag.add_argument('--max-hands', type=int, default=2, metavar='N', help='at most N hands per image (2)')
-    bag.add_argument('--min-score', type=float, default=0.3, metavar='S', help='leave out hands below it (0.3)')
+    bag.add_argument('--min-score', type=float, default=0.4, metavar='S', help='leave out hands below it (0.4)')
     live = parser.add_argument_group('live')
     live.add_argument('--transport', default='raw', choices=('raw', 'compressedDepth', 'compressed'),
                       help='of the depth images (raw)')

@@ -30,6 +30,7 @@ from hand_pose_ros.geometry import crop
 from hand_pose_ros.runtime import Engine
 from hand_pose_ros.scoring import explain
 from hand_pose_ros.skeleton import HAND21
+from hand_pose_ros.synthetic.crops import to_cube
 from hand_pose_ros.training.augmentation import Augmentation, augment
 from hand_pose_ros.training.fitting import fit_hand
 from hand_pose_ros.training.losses import Terms
@@ -207,13 +208,6 @@ def _surface(crops: Batch, count: int = 64) -> Tensor:
     column, row = at % size, at // size
     points = torch.stack([(column + 0.5) * 2 / size - 1, (row + 0.5) * 2 / size - 1, depth.gather(1, at)], dim=-1)
     return joints_in_metres(points, crops['cube_center'], crops['cube_side'])
-
-
-def to_cube(points: Tensor, center: Tensor, side: Tensor) -> Tensor:
-    """Points (N, J, 3) in metres -> cube units: the inverse of `joints_in_metres`."""
-    center = center[:, None]
-    plane = torch.cat([points[..., :2] * (center[..., 2:] / points[..., 2:]), points[..., 2:]], dim=-1)
-    return (plane - center) / (side / 2)[:, None, None]
 
 
 def fine_tune(network: nn.Module, recorded: Batch, synthetic: Batch, steps: int, progress: Progress) -> nn.Module:

@@ -32,7 +32,7 @@ def rate(samples: int, work: Callable[[], object], repeats: int = 5) -> float:
 def training(network: str, recipe_name: str, precision: torch.dtype | None) -> float:
     """Steps of a recipe on samples that are there already."""
     recipe = get_recipe(recipe_name)
-    module = build(network, joints=21, **({} if network == 'hand_dense' else {'bottleneck': 30}))
+    module = build(network, joints=21, bottleneck=30)
     objective = (DenseObjective if network == 'hand_dense' else PoseObjective)(module, recipe, HAND21)
     objective.train().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = make_optimizer(recipe, objective)

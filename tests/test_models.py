@@ -98,6 +98,36 @@ def test_every_pose_network_maps_patches_to_joints_and_learns(architecture, join
     assert sum(moving) >= len(moving) - (2 if architecture == 'hand_dense' else 0)
 
 
+def test_the_prior_behind_the_votes_starts_as_a_projection_and_learns_what_is_not_seen():
+    rng = np.random.default_rng(0)
+    poses = rng.normal(size=(2000, 30)) @ rng.normal(size=(30, 63)) * 0.05
+    prior = fit_prior(poses, 30)
+    network = build('hand_dense', width=8, bottleneck=30).eval()
+    network.set_prior(prior.mean, prior.components)
+    answer = network.forward_full(hand_patches(3))
+    expected = prior.reconstruct(prior.project(answer['votes'].detach().reshape(3, -1).numpy()))
+    np.testing.assert_allclose(answer['joints'].detach().reshape(3, -1), expected, atol=1e-5)
+
+    # One joint of each pose is lost, and the head is told which: it follows from the others.
+    truth = torch.tensor(poses, dtype=torch.float32).view(-1, 21, 3)
+    lost = torch.randint(21, (2000,))
+    confidence = torch.full((2000, 21), 4.0)
+    confidence[torch.arange(2000), lost] = -4.0
+    votes = truth.clone()
+    votes[torch.arange(2000), lost] = 0.0
+    head = network.head
+    optimizer = torch.optim.Adam(head.parameters(), 1e-3)
+    for _ in range(300):
+        optimizer.zero_grad()
+        F.mse_loss(head(votes[:1500], confidence[:1500]), truth[:1500]).backward()
+        optimizer.step()
+
+    def error(joints: torch.Tensor) -> float:
+        return float((joints - truth)[1500:][torch.arange(500), lost[1500:]].norm(dim=-1).mean())
+    projected = torch.tensor(prior.reconstruct(prior.project(votes.flatten(1).numpy()))).view_as(truth)
+    assert error(head(votes, confidence).detach()) < 0.7 * error(projected) < 0.7 * error(votes)
+
+
 @pytest.mark.parametrize('architecture', ['shallow', 'deep', 'multi_scale', 'resnet'])
 @pytest.mark.parametrize('bottleneck', [8, 30])
 def test_the_reconstruction_is_the_inverse_transform_of_the_prior_and_is_trained(architecture, bottleneck):

@@ -21,7 +21,7 @@ from hand_pose_ros.datasets.shards import MemoryShards
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.geometry import Cube, Intrinsics, crop
 from hand_pose_ros.models import build
-from hand_pose_ros.models.checkpoints import load_checkpoint
+from hand_pose_ros.models.checkpoints import load_checkpoint, save_checkpoint
 from hand_pose_ros.models.prior import fit_prior
 from hand_pose_ros.skeleton import HAND21
 from hand_pose_ros.training import experiments
@@ -428,6 +428,30 @@ def test_the_center_refiner_learns_where_the_palm_is(folder, tmp_path):
     with torch.no_grad():
         error = (network(batch['patch'].float()) - palm).norm(dim=-1).mean()
     assert error < 0.5 * (palm - palm.mean(0)).norm(dim=-1).mean()
+
+
+def test_a_network_starts_from_another_and_gets_a_prior_if_that_had_none(folder, tmp_path):
+    plain = tmp_path / 'plain.safetensors'
+    facts = {'skeleton': 'icvl16', 'cube_side': 0.3}
+    save_checkpoint(plain, build('hand_dense', joints=16, width=8), facts, half=False)
+    wanted = ('network=hand_dense', 'options.width=8')
+    run = tiny(folder, *wanted, f'base={plain}', out=tmp_path / 'first')
+    first = run.objective.network
+    patch = run.shards.read(0)['patch'].float()
+    with torch.no_grad():
+        answer = first.eval().forward_full(patch)
+        same = load_checkpoint(plain).network.forward_full(patch)
+    torch.testing.assert_close(answer['votes'], same['joints'], atol=1e-5, rtol=0)
+    gram = first.head.projection.weight @ first.head.reconstruction.weight
+    torch.testing.assert_close(gram, torch.eye(8), atol=1e-5, rtol=0)  # of principal components
+    first.head.output.bias.data.fill_(0.1)
+    path = tmp_path / 'with.safetensors'
+    save_checkpoint(path, first, facts, half=False)
+    second = tiny(folder, *wanted, f'base={path}', out=tmp_path / 'second').objective.network
+    pairs = zip(first.state_dict().values(), second.state_dict().values(), strict=True)
+    assert all(torch.equal(one, other) for one, other in pairs)
+    with pytest.raises(TrainingError, match='holds another network than the recipe names'):
+        tiny(folder, f'base={path}', out=tmp_path / 'third')
 
 
 def test_the_heads_of_a_dense_network_are_trained_for_what_they_say():

@@ -111,7 +111,7 @@ def _network_rows(architecture: str, threads: int, rounds: int, compiled: bool) 
     from hand_pose_ros.runtime import make_engine
     from hand_pose_ros.runtime.engine import Pipeline, TorchEngine
 
-    pipeline = Pipeline(build(architecture)).eval()
+    pipeline = Pipeline(build(architecture, bottleneck=30)).eval()
     patch = _patches(1)
     array = patch.numpy()
     engine = make_engine(pipeline.network, 'cpu', threads)
@@ -200,7 +200,7 @@ def _frame_rows(model: str | None, threads: int, rounds: int) -> dict[str, dict[
 
     def estimator(architecture: str, refiner: str | None = None, **options: Any) -> HandPoseEstimator:
         second = build(refiner) if refiner else None
-        engine = make_engine(build(architecture), 'cpu', threads, second)
+        engine = make_engine(build(architecture, bottleneck=30), 'cpu', threads, second)
         return HandPoseEstimator(engine, HAND21, min_score=-1, side='right', **options)
 
     estimators = {

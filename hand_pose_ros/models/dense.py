@@ -1,17 +1,20 @@
 """A small residual network that lets every visible piece of the hand vote for every joint; a design of ours.
 
 The maps have 32 x 32 cells. For each joint a cell tells the direction to it and how close it is; the joint is the mean
-of the votes, weighted by closeness (the encoding of AWR, Huang et al. 2020, in cube units).
+of the votes, weighted by closeness (the encoding of AWR, Huang et al. 2020, in cube units). With a bottleneck, the
+pose prior of the paper makes one hand of the joints.
 """
 
 from __future__ import annotations
 
 import torch
 import torch.nn.functional as F
+from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
+from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.geometry import PATCH_SIZE
-from hand_pose_ros.models.prior import plain_linear
+from hand_pose_ros.models.prior import PriorOverVotes, plain_linear
 
 CELLS = 32
 """Cells along each side of the maps; one covers 4 x 4 pixels of the patch."""
@@ -69,11 +72,12 @@ class HandDense(nn.Module):
     Args:
         joints: J.
         width: channels of the first stage; the cost grows with its square.
+        bottleneck: coefficients of the pose prior behind the votes; None = the votes as they are.
     """
 
     outputs = ('joints', 'confidence', 'hand', 'side', 'size')
 
-    def __init__(self, joints: int = 21, width: int = 32) -> None:
+    def __init__(self, joints: int = 21, width: int = 32, bottleneck: int | None = None) -> None:
         super().__init__()
         self.joints = joints
         w = width
@@ -84,8 +88,15 @@ class HandDense(nn.Module):
         self.fuse = nn.Sequential(_conv_norm(2 * w, 2 * w, 3), nn.ReLU())
         self.maps = nn.Conv2d(2 * w, 4 * joints, 1)
         self.summary = plain_linear(8 * w + joints, joints + 3)
+        self.head = PriorOverVotes(joints, bottleneck) if bottleneck else None
         nn.init.normal_(self.maps.weight, std=0.01)
         nn.init.zeros_(self.maps.bias)  # type: ignore[arg-type]
+
+    def set_prior(self, mean: ArrayLike, components: ArrayLike) -> None:
+        """Start the prior from a mean (3J,) and components (bottleneck, 3J): see `fit_prior`."""
+        if self.head is None:
+            raise HandPoseError('a network without a bottleneck takes no prior')
+        self.head.set_prior(mean, components)
 
     def forward(self, patch: Tensor) -> Tensor:
         """(B, 1, 128, 128) in [-1, 1] -> (B, J, 3) in cube units."""
@@ -96,7 +107,8 @@ class HandDense(nn.Module):
 
         joints (B, J, 3) in cube units; logits: confidence (B, J) that a joint is right, hand (B,) that this is one,
         side (B,) that it is a right hand; size (B,), the logarithm of the hand's size over the usual one; and for the
-        loss positions (B, 3, 32, 32), seen (B, 1, 32, 32), directions (B, J, 3, 32, 32), closeness (B, J, 32, 32).
+        loss votes (B, J, 3), the joints before the prior, positions (B, 3, 32, 32), seen (B, 1, 32, 32),
+        directions (B, J, 3, 32, 32), closeness (B, J, 32, 32).
         """
         x = self.stem(patch)  # (B, w, 32, 32)
         features = []
@@ -112,12 +124,16 @@ class HandDense(nn.Module):
         closeness = maps[:, 3 * self.joints:]
         positions, seen = cells(patch.float())
         with torch.autocast(patch.device.type, enabled=False):  # nor may training in half precision halve them
-            joints, agreement = decode(positions, seen, directions, closeness)
+            votes, agreement = decode(positions, seen, directions, closeness)
         summary = self.summary(torch.cat([features[3].mean(dim=(2, 3)), agreement.to(x.dtype)], dim=1))
+        confidence = summary[:, :self.joints]
+        with torch.autocast(patch.device.type, enabled=False):
+            # The confidence is to say how sure a joint is, not to be bent into what serves the prior.
+            joints = votes if self.head is None else self.head(votes, confidence.detach())
         return {
-            'joints': joints, 'confidence': summary[:, :self.joints],
+            'joints': joints, 'confidence': confidence,
             **dict(zip(('hand', 'side', 'size'), summary[:, self.joints:].unbind(1), strict=True)),
-            'positions': positions, 'seen': seen, 'directions': directions, 'closeness': closeness,
+            'votes': votes, 'positions': positions, 'seen': seen, 'directions': directions, 'closeness': closeness,
         }
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
@@ -83,22 +84,59 @@ class PoseHead(nn.Module):
 
     def set_prior(self, mean: ArrayLike, components: ArrayLike) -> None:
         """Start the reconstruction from mean (3J,) and components (k, 3J), k = the bottleneck."""
-        if self.reconstruction is None:
-            raise HandPoseError('a network without a bottleneck regresses joints directly and takes no prior')
-        weight, bias = (torch.as_tensor(np.asarray(a), dtype=torch.float32) for a in (components, mean))
-        if weight.T.shape != self.reconstruction.weight.shape or bias.shape != self.reconstruction.bias.shape:
-            raise HandPoseError(
-                f'a prior with components {tuple(weight.shape)} and mean {tuple(bias.shape)} does not fit '
-                f'a bottleneck of {self.output.out_features} and {self.joints} joints')
-        with torch.no_grad():
-            self.reconstruction.weight.copy_(weight.T)
-            self.reconstruction.bias.copy_(bias)
+        _set_reconstruction(self.reconstruction, mean, components)
 
     def forward(self, features: Tensor) -> Tensor:  # (B, F) -> (B, J, 3)
         output = self.output(self.hidden(features))
         if self.reconstruction is not None:
             output = self.reconstruction(output)
         return output.view(-1, self.joints, 3)
+
+
+class PriorOverVotes(nn.Module):
+    """Joints that were found one by one are made one hand: what is not seen follows from what is.
+
+    They are projected onto the principal components; a hidden layer, which sees them all and how sure each is, moves
+    the coefficients; the reconstruction gives joints again. All of it starts from the prior and is trained on.
+    """
+
+    HIDDEN = 256
+
+    def __init__(self, joints: int, bottleneck: int) -> None:
+        super().__init__()
+        self.projection = plain_linear(3 * joints, bottleneck)
+        self.hidden = plain_linear(4 * joints, self.HIDDEN)
+        self.output = nn.Linear(self.HIDDEN, bottleneck)
+        nn.init.zeros_(self.output.weight)
+        nn.init.zeros_(self.output.bias)
+        self.reconstruction = plain_linear(bottleneck, 3 * joints)
+
+    def set_prior(self, mean: ArrayLike, components: ArrayLike) -> None:
+        """Start projection and reconstruction from mean (3J,) and components (k, 3J), k = the bottleneck."""
+        _set_reconstruction(self.reconstruction, mean, components)
+        with torch.no_grad():
+            self.projection.weight.copy_(self.reconstruction.weight.T)
+            self.projection.bias.copy_(-self.projection.weight @ self.reconstruction.bias)
+
+    def forward(self, joints: Tensor, confidence: Tensor) -> Tensor:
+        """Joints (B, J, 3) in cube units, and logits (B, J) of how sure they are -> joints (B, J, 3)."""
+        dtype = self.projection.weight.dtype
+        joints, confidence = joints.to(dtype), confidence.to(dtype)
+        moved = self.output(F.relu(self.hidden(torch.cat([joints.flatten(1), confidence / 4], dim=1))))
+        return self.reconstruction(self.projection(joints.flatten(1)) + moved).view_as(joints)
+
+
+def _set_reconstruction(layer: nn.Linear | None, mean: ArrayLike, components: ArrayLike) -> None:
+    if layer is None:
+        raise HandPoseError('a network without a bottleneck takes no prior')
+    weight, bias = (torch.as_tensor(np.asarray(a), dtype=torch.float32) for a in (components, mean))
+    if weight.T.shape != layer.weight.shape or bias.shape != layer.bias.shape:
+        raise HandPoseError(
+            f'a prior with components {tuple(weight.shape)} and mean {tuple(bias.shape)} does not fit '
+            f'a bottleneck of {layer.in_features} and {layer.out_features // 3} joints')
+    with torch.no_grad():
+        layer.weight.copy_(weight.T)
+        layer.bias.copy_(bias)
 
 
 def relu_conv(inputs: int, outputs: int, size: int, stride: int = 1, padding: int = 0,

@@ -127,9 +127,8 @@ class Run:
         center = recipe.network == 'center_refiner'
         network = build(recipe.network, **({} if center else {'joints': joints}), **recipe.options)
         bottleneck = recipe.options.get('bottleneck')
-        if base is not None:
-            self._start_from(network, base)
-        elif bottleneck:
+        has_prior = base is not None and self._start_from(network, base)
+        if bottleneck and not has_prior:
             prior = fit_prior(self._training_poses(), bottleneck)
             network.set_prior(prior.mean, prior.components)  # type: ignore[operator]
             log.info('the prior keeps %.2f %% of the variance of the poses', 100 * prior.explained_variance_ratio.sum())
@@ -138,12 +137,18 @@ class Run:
         kind = CenterObjective if center else DenseObjective if hasattr(network, 'forward_full') else PoseObjective
         return kind(network, recipe, self.skeleton)
 
-    def _start_from(self, network: nn.Module, base: Checkpoint) -> None:
+    def _start_from(self, network: nn.Module, base: Checkpoint) -> bool:
+        """Take the weights of the base; False if it has none for the prior, which is all that it may lack."""
+        weights = {**network.state_dict(), **base.network.state_dict()}
+        lacking = network.state_dict().keys() - base.network.state_dict().keys()
         try:
-            network.load_state_dict(base.network.state_dict())
+            if not all(name.startswith('head.') for name in lacking):
+                raise RuntimeError(f'{min(lacking)} is missing')
+            network.load_state_dict(weights)
         except RuntimeError as error:
             raise TrainingError(f'{self.recipe.base} holds another network than the recipe names '
                                 f'({self.recipe.network}, {self.recipe.options})') from error
+        return not lacking
 
     def _training_poses(self) -> Tensor:
         """Poses as the network will meet them: one shard, augmented in several ways, is plenty for a covariance."""

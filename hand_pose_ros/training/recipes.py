@@ -79,7 +79,7 @@ RECIPES = {
                             momentum=0.0, weight_decay=0.0),
     # A dense network (reference: AWR, A2J), every sample augmented, a loss that never stops caring about millimetres,
     # AdamW with cosine decay, which needs no tuning per network, and averaged weights, worth a step of the decay.
-    'modern': Recipe(network='hand_dense', options={}, augmentation=PRESETS['modern'], loss='smooth_l1', knee=0.01,
+    'modern': Recipe(network='hand_dense', augmentation=PRESETS['modern'], loss='smooth_l1', knee=0.01,
                      optimizer='adamw', learning_rate=2e-3, schedule='cosine', warmup=0.02, weight_decay=0.01,
                      batch_size=64, samples=2_000_000, precision='bfloat16', average=0.998),
 }

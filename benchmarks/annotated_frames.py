@@ -6,18 +6,21 @@ FRAMES holds annotations.json: `frames`, each with sensor, file, width, height, 
 `points` {joint: [u, v, depth_mm] or null} and `doubtful` [joints]. Every frame is treated as the first one the
 estimator sees, detection included. Errors are lateral, at the annotated depth, in mm, over all visible fingertips that
 are not doubtful; a frame without a hand misses all of its fingertips, and these count as farther than any distance.
+Milliseconds are the median of whole frames, from the array in metres to the joints.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import time
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
+import hand_pose_ros.estimator
 from hand_pose_ros.depth import read_png
 from hand_pose_ros.drawing import contact_sheet, overlay
 from hand_pose_ros.estimator import HandEstimate, HandPoseEstimator
@@ -48,21 +51,28 @@ def main() -> None:
     parser.add_argument('--json', type=Path)
     parser.add_argument('--overlays', type=Path, help='write one sheet of all frames for each model here')
     parser.add_argument('--min-score', type=float, help='(that of the estimator)')
+    parser.add_argument('--looks', type=int, default=hand_pose_ros.estimator.LOOKS,
+                        help='how often a cube is read, where its joints are not in its middle (%(default)s)')
     parser.add_argument('--sides-known', action='store_true', help='tell the estimator whether it is a left hand')
     args = parser.parse_args()
+    hand_pose_ros.estimator.LOOKS = args.looks
     frames = json.loads((args.frames / 'annotations.json').read_text())['frames']
     table: dict[str, dict[str, Any]] = {}
     for model in args.model:
         options = {} if args.min_score is None else {'min_score': args.min_score}
         estimator = HandPoseEstimator.from_pretrained(model, device='cpu', **options)
+        estimator.warm_up()
         errors: dict[str, list[float]] = {}
+        seconds: dict[str, list[float]] = {}
         sides: dict[str, list[bool]] = {}
         pictures = []
         for frame in frames:
             depth = read_png(args.frames / frame['file'], frame['depth_scale_m'])
             estimator.reset()
             estimator.side = frame['side'] if args.sides_known else 'auto'
+            start = time.perf_counter()
             hands = estimator(depth, camera_of(frame))
+            seconds.setdefault(frame['sensor'], []).append(time.perf_counter() - start)
             hand = hands[0] if hands else None
             errors.setdefault(frame['sensor'], []).extend(tip_errors_mm(frame, hand).values())
             sides.setdefault(frame['sensor'], []).append(hand is not None and hand.side == frame['side'])
@@ -74,7 +84,8 @@ def main() -> None:
                 'median_mm': round(float(np.median(values)), 1),
                 'p90_mm': round(float(np.quantile(values, 0.9, method='lower')), 1),
                 'within_20_mm': round(float(np.mean(np.array(values) <= 20)), 3),
-                'side_right': round(float(np.mean(sides[sensor])), 3)}
+                'side_right': round(float(np.mean(sides[sensor])), 3),
+                'ms': round(1000 * float(np.median(seconds[sensor])), 1)}
         if args.overlays:
             args.overlays.mkdir(parents=True, exist_ok=True)
             cv2.imwrite(str(args.overlays / f'{name}.png'), contact_sheet(pictures, 6))

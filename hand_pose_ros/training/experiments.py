@@ -18,14 +18,15 @@ import torch
 from matplotlib.figure import Figure
 from torch import nn
 
-from hand_pose_ros.datasets import Batch
+from hand_pose_ros.datasets import Batch, joints_in_metres
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.evaluation import plots
 from hand_pose_ros.evaluation.results import Result, write_atomically, write_json
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.models import build
 from hand_pose_ros.models.checkpoints import Checkpoint, load_checkpoint
-from hand_pose_ros.skeleton import get_skeleton
+from hand_pose_ros.models.prior import fit_prior
+from hand_pose_ros.skeleton import Skeleton, get_skeleton
 from hand_pose_ros.training import figures
 from hand_pose_ros.training.folder import RunFolder
 from hand_pose_ros.training.loop import Machine, Run, open_shards
@@ -98,10 +99,19 @@ class Laboratory:
             return refiner(patch, joints, iterations=iterations) if refiner is not None else joints
 
         estimates, truths = estimate(predict, self.test, torch.device('cpu'))
-        skeleton = get_skeleton(checkpoint.metadata['skeleton'])
-        note = 'left hands are mirrored; crops as in training; cameras may be mixed: the intrinsics are nominal'
-        return Result(name, skeleton, _MIXED, estimates.double().numpy(), truths.double().numpy(), notes=(note,),
-                      info={'samples': checkpoint.metadata['samples'], 'dataset': self.recipe.dataset})
+        return _result(name, get_skeleton(checkpoint.metadata['skeleton']), estimates, truths,
+                       samples=checkpoint.metadata['samples'], dataset=self.recipe.dataset)
+
+    def truth_through(self, width: int, skeleton: Skeleton) -> Result:
+        """What principal components of the true poses of the test keep of them: about as good as any network with a
+        bottleneck of this width can be."""
+        joints, center, side = (torch.cat([batch[key][batch['hand_present']] for batch in self.test])
+                                for key in ('joints', 'cube_center', 'cube_side'))
+        poses = joints.flatten(1).numpy()
+        prior = fit_prior(poses, min(width, len(poses)))
+        kept = torch.from_numpy(prior.reconstruct(prior.project(poses))).float().view_as(joints)
+        return _result(f'truth in {width} components', skeleton, joints_in_metres(kept, center, side),
+                       joints_in_metres(joints, center, side), dataset=self.recipe.dataset)
 
     def write(self, name: str, table: str, values: dict[str, Any], figure: Figure) -> str:
         """NAME.json, NAME.md, NAME.png and NAME.svg; returns the table."""
@@ -113,6 +123,11 @@ class Laboratory:
     def write_results(self, name: str, results: Sequence[Result], figure: Figure) -> str:
         """The same for results of networks."""
         return self.write(name, accuracy_table(results), {'results': [result.summary() for result in results]}, figure)
+
+
+def _result(name: str, skeleton: Skeleton, estimates: torch.Tensor, truths: torch.Tensor, **info: Any) -> Result:
+    note = 'left hands are mirrored; crops as in training; cameras may be mixed: the intrinsics are nominal'
+    return Result(name, skeleton, _MIXED, estimates.double().numpy(), truths.double().numpy(), notes=(note,), info=info)
 
 
 def label(architecture: str, width: int | None) -> str:
@@ -142,7 +157,8 @@ def bottleneck(lab: Laboratory) -> str:
     """Width of the bottleneck of the Deep network, against direct regression (the paper's left figures)."""
     results = [lab.result(label('deep', width), lab.network('deep', width)) for width in WIDTHS]
     lab.write_results('bottleneck-curves', results, plots.curves(results))
-    return lab.write_results('bottleneck', results, figures.bottleneck(results, WIDTHS))
+    floors = [lab.truth_through(width, results[0].skeleton) for width in WIDTHS if width is not None]
+    return lab.write_results('bottleneck', [*results, *floors], figures.bottleneck(results, floors, WIDTHS))
 
 
 def refinement(lab: Laboratory) -> str:

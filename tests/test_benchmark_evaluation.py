@@ -20,6 +20,10 @@ def test_a_network_is_scored_on_the_frames_with_a_hand(tmp_path):
     assert summary['frames'] == present < 60
     assert np.isfinite(summary['mean_mm']) and summary['mean_mm'] > 10  # it has learned nothing
     assert sum(row['joints'] for row in summary['calibration_20_mm']) == 21 * present
+    parts = [summary['visible_joints'], summary['hidden_joints']]
+    assert sum(part['joints'] for part in parts) == 21 * present
+    assert sum(part['joints'] * part['mean_mm'] for part in parts) / (21 * present) == pytest.approx(
+        summary['mean_mm'], abs=0.01)
 
 
 def test_calibration_counts_what_was_right():

@@ -29,7 +29,8 @@ def evaluate_benchmark(model: str | None = None, device: str = 'auto', frames: i
                        progress: Progress = lambda items, total: items) -> Result:
     """Joints of the frames of synthetic-test-v1 that show a hand; left hands are mirrored, so the side is given.
 
-    For networks that judge themselves `info` has the calibration of the confidence of joints, how often the side is
+    `info` has the errors of joints that the camera sees and of those that it does not. For networks that judge
+    themselves it also has the calibration of the confidence of joints, how often the side is
     found (from both mirrorings of each patch), and the share of frames with and without a hand that the score lets
     pass.
 
@@ -39,7 +40,7 @@ def evaluate_benchmark(model: str | None = None, device: str = 'auto', frames: i
     """
     checkpoint = load_checkpoint(model)
     engine = make_engine(checkpoint.network, device=device, refiner=checkpoint.refiner)
-    joints, truth, judged = [], [], []
+    joints, truth, visible, judged = [], [], [], []
     batch_size = 50
     for batch in progress(benchmark.frames(frames, batch=batch_size), -(-frames // batch_size)):
         answer = engine.run_full(batch['patch'].numpy())
@@ -50,17 +51,27 @@ def evaluate_benchmark(model: str | None = None, device: str = 'auto', frames: i
         expected = joints_in_metres(batch['joints'], *cube).double().numpy()
         joints.append(predicted[present])
         truth.append(expected[present])
+        visible.append(batch['visible'].numpy()[present])
         if 'confidence' in answer:
             mirrored = engine.run_full(np.ascontiguousarray(batch['patch'].numpy()[..., ::-1]))
             right = np.linalg.norm(predicted - expected, axis=-1) * 1000 <= NEAR_MM
             judged.append((answer['confidence'], right, answer['hand'], answer['side'] > mirrored['side'], present))
     skeleton = get_skeleton(checkpoint.metadata['skeleton'])
-    info = {'model': model or DEFAULT, 'engine': engine.name}
+    info = {'model': model or DEFAULT, 'engine': engine.name,
+            **_by_visibility(np.concatenate(joints), np.concatenate(truth), np.concatenate(visible))}
     if judged:
         info |= _self_knowledge(*(np.concatenate(parts) for parts in zip(*judged, strict=True)))
     note = 'crops and sides are those of the benchmark; cameras are mixed, the intrinsics are nominal'
     return Result(str(model or DEFAULT), skeleton, Intrinsics(475.0, 475.0, 320.0, 240.0, 640, 480),
                   np.concatenate(joints), np.concatenate(truth), notes=(note,), info=info)
+
+
+def _by_visibility(joints: NDArray[np.float64], truth: NDArray[np.float64],
+                   visible: NDArray[np.bool_]) -> dict[str, Any]:
+    errors_mm = 1000 * np.linalg.norm(joints - truth, axis=-1)
+    return {name: {'joints': int(of.sum()), 'mean_mm': float(errors_mm[of].mean()),
+                   'median_mm': float(np.median(errors_mm[of]))}
+            for name, of in (('visible_joints', visible), ('hidden_joints', ~visible)) if of.any()}
 
 
 def _self_knowledge(confidence: NDArray[np.float32], right: NDArray[np.bool_], hand: NDArray[np.float32],

@@ -98,6 +98,13 @@ def test_every_pose_network_maps_patches_to_joints_and_learns(architecture, join
     assert sum(moving) >= len(moving) - (2 if architecture == 'hand_dense' else 0)
 
 
+def test_shallow_starts_deaf_to_the_background():
+    """Or Adam kills its hidden units in the first steps: after 300,000 samples it answered the mean pose."""
+    network = build('shallow')
+    assert network.features(torch.ones(1, 1, 128, 128)).abs().max() < 1e-5
+    assert network.features(hand_patches(1)).abs().max() > 0.01
+
+
 def test_the_prior_behind_the_votes_starts_as_a_projection_and_learns_what_is_not_seen():
     rng = np.random.default_rng(0)
     poses = rng.normal(size=(2000, 30)) @ rng.normal(size=(30, 63)) * 0.05

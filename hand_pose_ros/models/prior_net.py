@@ -42,13 +42,13 @@ class Shallow(PoseNetwork):
     """One convolution, one pooling, one hidden layer. The sizes are ours: the paper gives no figures."""
 
     def __init__(self, joints: int = 21, bottleneck: int | None = None, dropout: float = 0.3) -> None:
-        features = nn.Sequential(_convolution(1, 8, 5, pool=4), nn.Flatten())  # (8, 31, 31) = 7688
+        maps = _convolution(1, 8, 5, pool=4)
+        features = nn.Sequential(maps, nn.Flatten())  # (8, 31, 31) = 7688
         super().__init__(features, joints, bottleneck, hidden=(1024,), dropout=dropout)
         # Nothing between the background, which is 1, and the many inputs of the hidden layer: a response to it would be
         # common to nearly all of them, and the first steps of Adam would silence the hidden units for good.
-        convolution = features[0][0]
         with torch.no_grad():
-            convolution.bias.copy_(-convolution.weight.sum((1, 2, 3)))
+            maps[0].bias.copy_(-maps[0].weight.sum((1, 2, 3)))  # type: ignore[operator]
 
 
 class Deep(PoseNetwork):

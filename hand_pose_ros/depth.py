@@ -24,6 +24,9 @@ DEPTH_ENCODINGS: dict[str, np.dtype[Any]] = {
 MAX_PIXELS, MAX_SIDE = 1 << 24, 1 << 13
 """Far above any depth camera: an image that claims more is corrupt and gets neither memory nor, long and thin, time."""
 
+MAX_OUTSIDE = 0.99
+"""With more of the readings out of range, the unit of depth is likely wrong."""
+
 _PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
 _HEADER = struct.Struct('<iff')  # compressedDepth: kind of quantisation and its parameters A and B
 _SMALLEST, _LARGEST = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
@@ -116,6 +119,19 @@ def read_png(path: str | Path, depth_scale: float = 0.001) -> NDArray[np.float32
         except OSError as error:
             raise InputError(f'the file cannot be read ({error.strerror}): check the path') from None
         return to_metres(_decode_png(memoryview(data)), depth_scale)
+
+
+def depth_problem(depth: NDArray[np.float32], near: float, far: float) -> str:
+    """What may be wrong with a depth image (H, W) [m] in which there was no hand; empty when it looks sane."""
+    sample = depth[::8, ::8]
+    readings = sample[sample > 0]
+    if readings.size == 0:
+        return 'the depth image has no reading at all (all zero or not finite): is something in front of the lens?'
+    outside = float(np.mean((readings < near) | (readings > far)))
+    if outside < MAX_OUTSIDE:
+        return ''
+    return (f'{outside:.0%} of the depth is outside {near:g} to {far:g} m (median {float(np.median(readings)):.3g} m): '
+            'check depth_scale (0.001 for most cameras, 0.000125 for a RealSense SR305), or the range')
 
 
 def to_metres(units: NDArray[np.uint16], depth_scale: float = 0.001) -> NDArray[np.float32]:

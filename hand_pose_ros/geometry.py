@@ -69,8 +69,8 @@ class Intrinsics:
         """Raise InputError unless the intrinsics belong to an image of this size."""
         if (width, height) != (self.width, self.height):
             raise InputError(
-                f'the depth image has {width}x{height} pixels but its camera_info is for {self.width}x{self.height}: '
-                'use the camera_info that is published beside this very image')
+                f'the depth image has {width}x{height} pixels but its intrinsics are for {self.width}x{self.height}: '
+                'use those of this very image (the camera_info that is published beside it)')
 
     def check_lens(self) -> None:
         """Raise InputError if no lens can have these intrinsics: what is computed with them may be anything."""

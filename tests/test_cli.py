@@ -32,7 +32,7 @@ def test_bad_arguments_are_exit_code_2(arguments, capsys):
 
 
 def test_failure_is_exit_code_1_and_one_sentence(tmp_path, capsys):
-    assert main(['estimate', str(tmp_path / 'no_such_folder')]) == 1
+    assert main(['estimate', str(tmp_path / 'no_such_folder'), '--out', 'joints.npz']) == 1
     error = capsys.readouterr().err
     assert 'no_such_folder' in error and error.count('\n') == 1
 

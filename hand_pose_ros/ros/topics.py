@@ -17,6 +17,8 @@ except ImportError:  # ROS 2 Humble
     from rclpy.qos_event import SubscriptionEventCallbacks
 
 IMAGE, CAMERA_INFO, REGION = 'depth/image_rect', 'depth/camera_info', 'hand/region'
+TRANSPORTS = ('compressedDepth', 'compressed')
+"""Besides raw, the better one first; each is a topic below that of the image."""
 
 NO_REGION = (f'no region arrived on {REGION}, so no hand is looked for: publish where it is in the depth image, or set '
              'the parameter detector to nearest')
@@ -74,6 +76,10 @@ def explain_silence(node: Node, topic: str, message_type: type, seconds: float) 
     said = f'no image arrived on {topic} for {seconds:.0f} s; the topic is {describe_publishers(node, topic)}'
     infos = node.get_publishers_info_by_topic(topic)
     if not infos:
+        for transport in TRANSPORTS:
+            if node.count_publishers(f'{topic}/{transport}'):
+                return (f'{said}, but depth is published on {topic}/{transport}: set the parameter transport to '
+                        f'{transport} (at the start: --ros-args -p transport:={transport})')
         ours = {topic, *(publisher.topic_name for publisher in node.publishers)}
         others = [name for name, types in node.get_topic_names_and_types() if topic_type in types and name not in ours]
         where = f' ({topic_type} is published on {", ".join(others)})' if others else ''

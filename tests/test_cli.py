@@ -3,10 +3,12 @@
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from hand_pose_ros.cli import VERBS, main
+from hand_pose_ros.synthetic.sensors import SENSORS
 
 
 @pytest.mark.parametrize('verb', VERBS)
@@ -15,6 +17,13 @@ def test_every_verb_has_help_with_examples(verb, capsys):
         main([verb, '--help'])
     assert exit_.value.code == 0
     assert f'hand-pose {verb}' in capsys.readouterr().out.split('examples:')[1]
+
+
+def test_names_of_sensors_are_in_the_help(capsys):
+    with pytest.raises(SystemExit):
+        main(['synth', 'show', '--help'])
+    text = capsys.readouterr().out
+    assert all(sensor.name in text for sensor in SENSORS)
 
 
 def test_the_list_of_verbs_is_complete(capsys):
@@ -45,8 +54,12 @@ def test_listing_the_verbs_loads_no_heavy_library():
 
 @pytest.mark.skipif(sys.platform != 'linux', reason='elsewhere there is always a display')
 def test_to_view_without_a_display_is_refused_at_once(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, 'rerun', SimpleNamespace(blueprint=None))  # as if it were installed
     for name in ('DISPLAY', 'WAYLAND_DISPLAY'):
         monkeypatch.delenv(name, raising=False)
     bag = Path(__file__).parents[1] / 'demo' / 'hand.mcap'
     assert main(['view', str(bag)]) == 1
     assert '--save FILE.rrd' in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, 'rerun', None)  # else who then says --save only learns that Rerun is missing
+    assert main(['view', str(bag)]) == 1
+    assert "'.[view]'" in capsys.readouterr().err

@@ -15,7 +15,7 @@ from hand_pose_ros.estimator import HandPoseEstimator
 
 # ruff: noqa: F811 (a fixture from another file is imported, and then an argument)
 
-pytest.importorskip('rerun', reason="needs Rerun: pip install 'hand_pose_ros[view]'")
+pytest.importorskip('rerun', reason="needs Rerun: pip install '.[view]'")
 
 
 def with_(weights):

@@ -36,7 +36,8 @@ _CALLS = 10
 def add_parser(subparsers: Any) -> None:
     """Declare the verb."""
     parser = subparsers.add_parser(
-        'bench', help='measure speed on this machine', description=__doc__.split(': ')[1], epilog=_EXAMPLES,
+        'bench', help='measure speed on this machine', epilog=_EXAMPLES,
+        description='Measure how fast this machine runs networks, refinement, every stage and whole frames.',
         formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--json', type=Path, metavar='FILE', help='write the rows there too')
     parser.add_argument('--model', help='whole frames with these weights, by name or path (random ones)')

@@ -40,8 +40,8 @@ Findings = Iterator[tuple[Literal['ok', 'note', 'WRONG'], str]]
 def add_parser(subparsers: Any) -> None:
     """Add this verb to the command line."""
     subparsers.add_parser('doctor', help='what is installed, whether it works, and what to do where it does not',
-                          description=__doc__.partition(': ')[2], epilog=EXAMPLES,
-                          formatter_class=argparse.RawDescriptionHelpFormatter)
+                          description='Say what is installed here, whether it works, and what to do where it does not.',
+                          epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -119,8 +119,8 @@ def _ros() -> Findings:
             yield 'WRONG', (f'ROS 2 {distro} is sourced, but {sys.executable} finds no rclpy: use the Python that this '
                             'ROS was built for, in a virtual environment made with --system-site-packages')
         else:
-            yield 'note', ('none: the node, replay and demo need it, all else works; source its setup file, or '
-                           "pip install 'hand_pose_ros[ros]'")
+            yield 'note', ('none: the node, replay and demo need it, all else works; source its setup file, or in the '
+                           "checkout: pip install '.[ros]'")
         return
     from hand_pose_ros.ros.qos import middleware
 

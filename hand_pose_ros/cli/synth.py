@@ -32,6 +32,7 @@ _ZOOM = 2
 
 def add_parser(subparsers: Any) -> None:
     """Declare the verb."""
+    from hand_pose_ros.synthetic.sensors import SENSORS  # imports torch, as all that this verb does
     parser = subparsers.add_parser(
         'synth', help='make or show synthetic depth hands', epilog=_EXAMPLES,
         description='Hands of many shapes in many poses, seen by simulated depth sensors, as networks are trained on.',
@@ -39,7 +40,8 @@ def add_parser(subparsers: Any) -> None:
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument('--split', default='train', choices=('train', 'val', 'test'), help='(train)')
     common.add_argument('--start', type=int, default=0, metavar='I', help='index of the first sample (0)')
-    common.add_argument('--sensors', nargs='+', metavar='NAME', help='(all)')
+    common.add_argument('--sensors', nargs='+', metavar='NAME',
+                        help=f'of {", ".join(sensor.name for sensor in SENSORS)} (all)')
     common.add_argument('--rig', type=Path, metavar='GLB', help="another skin: a glTF hand with WebXR's joint names")
     real = argparse.ArgumentParser(add_help=False)
     real.add_argument('--real', nargs=6, action='append', default=[],

@@ -101,15 +101,15 @@ class Scene:
     """
 
     def __init__(self, path: Path | None) -> None:
-        if path is None and sys.platform == 'linux' and not {'DISPLAY', 'WAYLAND_DISPLAY'} & os.environ.keys():
-            raise HandPoseError('there is no display for the viewer: write a file with --save FILE.rrd and open it '
-                                'where there is one, with rerun FILE.rrd')
         try:
             import rerun
             from rerun import blueprint
         except ImportError as error:
-            raise HandPoseError(f"hand-pose view needs Rerun ({error}): pip install 'hand_pose_ros[view]' (or "
-                                'rerun-sdk)') from error
+            raise HandPoseError(f"hand-pose view needs Rerun ({error}): in the checkout, pip install '.[view]', or "
+                                'anywhere pip install rerun-sdk') from error
+        if path is None and sys.platform == 'linux' and not {'DISPLAY', 'WAYLAND_DISPLAY'} & os.environ.keys():
+            raise HandPoseError('there is no display for the viewer: write a file with --save FILE.rrd and open it '
+                                'where there is one, with rerun FILE.rrd')
         self._rerun, self._path = rerun, path
         self._markers: HandMarkers | None = None
         views = blueprint.Horizontal(blueprint.Spatial3DView(origin='/', name='hands in 3D'), blueprint.Spatial2DView(

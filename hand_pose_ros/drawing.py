@@ -180,5 +180,6 @@ def _dot(picture: Picture, center: NDArray[np.float64], radius: float, color: tu
 
 
 def _write(picture: Picture, text: str) -> None:
-    for color, thickness in (((0, 0, 0), 4), ((255, 255, 255), 1)):
-        cv2.putText(picture, text, (10, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.7, color, thickness, cv2.LINE_AA)
+    around = [((x, y), (0, 0, 0)) for x in (-1, 0, 1) for y in (-1, 0, 1)]  # a thick outline has wider letters
+    for (x, y), color in (*around, ((0, 0), (255, 255, 255))):
+        cv2.putText(picture, text, (10 + x, 24 + y), cv2.FONT_HERSHEY_SIMPLEX, 0.7, color, 1, cv2.LINE_AA)

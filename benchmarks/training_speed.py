@@ -5,6 +5,7 @@ Time of the process and not of the clock is taken, so the numbers hold on a mach
 
 from __future__ import annotations
 
+import argparse
 import time
 from collections.abc import Callable
 
@@ -50,6 +51,7 @@ def training(network: str, recipe_name: str, precision: torch.dtype | None) -> f
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     torch.set_num_threads(1)
     keep_freed_memory()
     data, numbers = open_dataset('synthetic', 'train'), torch.arange(128)

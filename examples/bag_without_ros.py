@@ -8,6 +8,7 @@ import csv
 import sys
 
 from hand_pose_ros.bags import DepthBag
+from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.estimator import HandPoseEstimator
 
 
@@ -26,4 +27,7 @@ def main() -> None:
 if __name__ == '__main__':
     if len(sys.argv) != 2:
         sys.exit(__doc__)
-    main()
+    try:
+        main()
+    except HandPoseError as error:
+        sys.exit(str(error))

@@ -5,11 +5,13 @@
 """
 
 import argparse
+import sys
 
 import cv2
 
 from hand_pose_ros.depth import read_png
 from hand_pose_ros.drawing import overlay
+from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.estimator import HandPoseEstimator
 from hand_pose_ros.geometry import Intrinsics
 
@@ -36,4 +38,7 @@ def main() -> None:
 
 
 if __name__ == '__main__':
-    main()
+    try:
+        main()
+    except HandPoseError as error:
+        sys.exit(str(error))

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from hand_pose_ros.bags import BagWriter, DepthBag
 from hand_pose_ros.cli import main as hand_pose
+from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.estimator import HandPoseEstimator
 
 
@@ -52,4 +53,7 @@ def main() -> int:
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except HandPoseError as error:
+        sys.exit(str(error))

@@ -107,6 +107,17 @@ def test_bag_without_ros(run: Callable[..., str], film: Film) -> None:
     assert np.median(errors) < FAR_OFF_M
 
 
+@pytest.mark.parametrize('command', [
+    'depth_png.py missing.png --intrinsics 140 140 80 60', 'bag_without_ros.py missing.mcap',
+    'train_on_your_bags.py --train missing.mcap --val missing.mcap --out mine'])
+def test_bad_input_is_one_sentence(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    name, *arguments = command.split()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, 'argv', [name, *arguments])
+    with pytest.raises(SystemExit, match=r'missing\.\w+: '):
+        runpy.run_path(str(EXAMPLES / name), run_name='__main__')
+
+
 def test_train_on_your_bags(run: Callable[..., str], film: Film) -> None:
     write_bag(Path('monday.mcap'), film[:6])
     write_bag(Path('tuesday.mcap'), film[6:])

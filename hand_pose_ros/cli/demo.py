@@ -72,6 +72,8 @@ def run(args: argparse.Namespace) -> int:
     _write(args.out / 'summary.json', json.dumps(summary, indent=2).encode() + b'\n')
     for name, value in summary.items():
         print(f'  {name.replace("_", " "):<22}{value if isinstance(value, int) or value is None else f"{value:.1f}"}')
+    print('latency: from an image to its joints at a listener beside the node; with transport and decoding (PNG in the '
+          'bag that ships)')
     print(f'see {args.out / "sheet.png"} and {args.out / "animation.webp"}')
     return 0 if summary['frames_answered'] == summary['frames_in'] else 1
 

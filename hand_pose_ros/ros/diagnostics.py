@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
-from numpy.typing import NDArray
 
 from hand_pose_ros.ros.topics import remedy_for_lost_images
 
@@ -24,8 +23,6 @@ MAX_AGE_S = 10.0
 """Older images come from a bag, not from a camera: their age says nothing."""
 MAX_KINDS = 100
 """So many different complaints are remembered."""
-MAX_OUTSIDE = 0.99
-"""With so much of the depth out of range not even a hand is left."""
 
 
 @dataclass
@@ -131,16 +128,3 @@ def _judge(window: _Window, state: str, published: bool, silence: str) -> tuple[
         return DiagnosticStatus.WARN, (f'{counts["dropped"]} of {counts["received"]} images of a second were dropped: '
                                        'this machine is too slow, or too busy, for their rate')
     return DiagnosticStatus.OK, f'{counts["answered"]} images answered, {counts["hands"]} hands'
-
-
-def depth_problem(depth: NDArray[np.float32], near: float, far: float) -> str:
-    """What may be wrong with a depth image (H, W) [m] in which there was no hand; empty when it looks sane."""
-    sample = depth[::8, ::8]
-    readings = sample[sample > 0]
-    if readings.size == 0:
-        return 'the depth image has no reading at all (all zero or not finite): is something in front of the lens?'
-    outside = float(np.mean((readings < near) | (readings > far)))
-    if outside < MAX_OUTSIDE:
-        return ''
-    return (f'{outside:.0%} of the depth is outside {near:g} to {far:g} m (median {float(np.median(readings)):.3g} m): '
-            'check the parameter depth_scale, or min_depth and max_depth')

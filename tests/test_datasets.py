@@ -1,6 +1,7 @@
 """Datasets are read in the formats they are distributed in, and samples are kept on disk without surprises."""
 
 import gzip
+import multiprocessing
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -292,6 +293,21 @@ def test_a_missing_frame_stops_the_making_of_its_shard(tmp_path):
     try:
         with pytest.raises(DatasetError, match=r'test_seq_2/image_0000\.png is damaged'):
             shards.read(1)
+    finally:
+        shards.close()
+
+
+def test_closing_ends_the_processes_at_once_and_reading_starts_them_again(tmp_path):
+    write_icvl(tmp_path / 'icvl', np.random.default_rng(5))
+    endless = DiskShards(partial(open_dataset, 'synthetic', 'train'), tmp_path / 'cache', 200_000)
+    endless.keep([0, 1])
+    endless.close()
+    assert not multiprocessing.active_children()
+    shards = DiskShards(partial(open_dataset, 'icvl', 'test', tmp_path / 'icvl'), tmp_path / 'cache', 2)
+    try:
+        for number in (0, 1):
+            assert len(shards.read(number)['patch']) > 0
+            shards.close()
     finally:
         shards.close()
 

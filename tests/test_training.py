@@ -253,6 +253,7 @@ def test_any_value_of_a_recipe_can_be_replaced():
 
 @pytest.mark.parametrize(('override', 'message'), [
     ('lr=1', "no 'lr'"), ('samples=many', 'not of type'), ('samples=1.5', 'not of type'), ('seed', 'key=value'),
+    ('samples=-5', '--set samples=-5: must be at least 1'), ('batch_size=0', 'at least 1'), ('seed=-1', 'at least 0'),
     ('augmentation=strong', 'choose one of'), ('augmentation.strong=1', "no 'strong'"), ('seed.x=1', 'is one value')])
 def test_a_wrong_override_is_one_sentence(override, message):
     with pytest.raises(HandPoseError, match=message):
@@ -321,6 +322,8 @@ def test_a_stopped_run_continues_bit_for_bit(folder, tmp_path, recipe):
     run._train_step = stopping
     with pytest.raises(TrainingError, match=r'after 28 samples; continue with --resume'):
         run.train()
+    facts = load_checkpoint(tmp_path / 'stopped' / 'last.safetensors').metadata  # weights to use
+    assert (facts['samples'], facts['validation']) == (28, {})
     again = tiny(folder, *overrides, recipe=recipe, out=tmp_path / 'stopped')
     again.train(resume=True)
     assert same_state(tmp_path / 'whole', tmp_path / 'stopped')
@@ -356,6 +359,42 @@ def test_a_killed_run_continues_bit_for_bit(folder, tmp_path):
         with pytest.raises(TrainingError, match='continue with --resume'):
             run.train(resume)
     assert same_state(tmp_path, tmp_path / 'whole')
+
+
+@pytest.mark.parametrize('width', ['8', 'none'])  # waits for the poses of its prior, or for the samples of a step
+def test_ctrl_c_before_the_first_step_ends_a_run_at_once(tmp_path, width):
+    """As in a terminal, where every process gets it; once more while it ends. The samples would take an hour."""
+    sets = [part for item in ('shard_size=200_000', f'options.bottleneck={width}') for part in ('--set', item)]
+    process = subprocess.Popen([sys.executable, '-m', 'hand_pose_ros.cli', 'train', 'paper', '--threads', '1', '--out',
+                                str(tmp_path / 'run'), '--cache', str(tmp_path / 'cache'), *sets],
+                               stderr=subprocess.PIPE, text=True, start_new_session=True)
+    try:
+        for awaited in ('making samples of synthetic-train', 'hand-pose train: interrupted'):
+            while awaited not in (line := process.stderr.readline()):
+                assert line and 'Traceback' not in line
+            os.killpg(process.pid, signal.SIGINT)
+        process.communicate(timeout=60)  # which ends when no child holds its end of the pipe any more
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+    assert process.returncode != 0 and not list((tmp_path / 'cache').rglob('*.*'))
+
+
+def test_a_signal_does_not_wait_for_samples_and_the_run_continues_bit_for_bit(folder, tmp_path):
+    tiny(folder, 'samples=40', out=tmp_path / 'whole').train()
+    run = tiny(folder, 'samples=40', out=tmp_path / 'stopped')
+    batch = run.stream.batch
+
+    def endless(step):
+        if step == 7:
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(600)
+        return batch(step)
+    run.stream.batch = endless
+    with pytest.raises(TrainingError, match=r'after 28 samples; continue with --resume'):
+        run.train()
+    tiny(folder, 'samples=40', out=tmp_path / 'stopped').train(resume=True)
+    assert same_state(tmp_path / 'whole', tmp_path / 'stopped')
 
 
 def run_state(path: Path) -> dict:

@@ -29,8 +29,11 @@ NAMES = ('networks', 'bottleneck', 'refinement', 'joints', 'runtime', 'qualitati
 def add_parser(subparsers: Any) -> None:
     from hand_pose_ros.cli.train import add_machine_arguments
 
-    parser = subparsers.add_parser('experiment', help='repeat an experiment of the paper', epilog=EPILOG,
-                                   formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = subparsers.add_parser(
+        'experiment', help='repeat an experiment of the paper', epilog=EPILOG,
+        description='Repeat an experiment of the paper: train the networks that it needs, test them, and write tables '
+                    'and plots.\nThis may take hours; after Ctrl-C, the same command goes on.',
+        formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('name', choices=NAMES, metavar='NAME', help='see below')
     parser.add_argument('--out', type=Path, required=True, metavar='OUT', help='folder of results and trained networks')
     parser.add_argument('--recipe', default='paper', help='what all networks are trained by (default: %(default)s)')
@@ -38,15 +41,13 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    import logging
-
     from tqdm.contrib.logging import logging_redirect_tqdm
 
-    from hand_pose_ros.cli.train import machine
+    from hand_pose_ros.cli.train import machine, show_progress
     from hand_pose_ros.training.experiments import EXPERIMENTS, Laboratory
     from hand_pose_ros.training.recipes import get_recipe
 
-    logging.basicConfig(level=logging.INFO, format='%(message)s')
+    show_progress()
     recipe = get_recipe(args.recipe, args.overrides)
     args.out.mkdir(parents=True, exist_ok=True)
     with logging_redirect_tqdm():

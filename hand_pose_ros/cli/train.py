@@ -20,8 +20,11 @@ recipes: paper, original-code, modern. docs/training.md says what they do, train
 
 
 def add_parser(subparsers: Any) -> None:
-    parser = subparsers.add_parser('train', help='train a network from a recipe', epilog=EPILOG,
-                                   formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = subparsers.add_parser(
+        'train', help='train a network from a recipe', epilog=EPILOG,
+        description='Train a network from a recipe, on synthetic hands or a recorded dataset. This may take hours: '
+                    'Ctrl-C stops\nafter the current step and leaves weights to use, and --resume goes on from there.',
+        formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('recipe', nargs='?', help='paper, original-code or modern (with --resume: that of the run)')
     parser.add_argument('--out', type=Path, required=True, metavar='RUN', help='folder of the run')
     parser.add_argument('--resume', action='store_true', help='continue the run in RUN')
@@ -50,9 +53,17 @@ def machine(args: argparse.Namespace) -> Any:
     return Machine(args.cache, args.device, args.workers, args.threads, args.cache_gb)
 
 
-def run(args: argparse.Namespace) -> int:
+def show_progress() -> None:
+    """Print what is logged, and let a second Ctrl-C, while Python cleans up after the first, end it without a word."""
+    import atexit
     import logging
+    import signal
 
+    logging.basicConfig(level=logging.INFO, format='%(message)s')
+    atexit.register(signal.signal, signal.SIGINT, signal.SIG_DFL)
+
+
+def run(args: argparse.Namespace) -> int:
     from tqdm.contrib.logging import logging_redirect_tqdm
 
     from hand_pose_ros.training.distributed import process_group
@@ -64,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
         args.parser.error('--resume continues with the recipe of the run: give neither RECIPE nor --set')
     if not args.resume and not args.recipe:
         args.parser.error('give a RECIPE (paper, original-code or modern), or --resume')
-    logging.basicConfig(level=logging.INFO, format='%(message)s')
+    show_progress()
     recipe = RunFolder(args.out).recipe() if args.resume else get_recipe(args.recipe, args.overrides)
     with logging_redirect_tqdm(), process_group(args.device):
         Run(args.out, recipe, machine(args)).train(args.resume)

@@ -6,6 +6,7 @@ Shard i of a dataset always holds the samples [i N, (i + 1) N), so whoever makes
 from __future__ import annotations
 
 import hashlib
+import logging
 import multiprocessing
 import multiprocessing.connection
 import os
@@ -23,6 +24,8 @@ from safetensors.torch import save_file
 
 from hand_pose_ros.datasets.base import Batch, Dataset, DatasetError
 from hand_pose_ros.datasets.memory import keep_freed_memory
+
+log = logging.getLogger(__name__)
 
 _BATCH = 64  # samples made at a time: enough to be efficient, few enough to fit the caches
 
@@ -94,8 +97,16 @@ class DiskShards:
         self._open = {i: self._open[i] for i in needed if i in self._open}
         for shard in needed:
             if shard not in self._making and not self.path(shard).exists():
-                self._pool = self._pool or self._start_pool()
-                self._making[shard] = self._pool.submit(_make_file, shard, self.path(shard))
+                if self._pool is None:
+                    log.info('making samples of %s, which may take minutes; they are kept in %s',
+                             self.dataset.name, self._folder)
+                    self._pool = self._start_pool()
+                # The training run decides when to stop: a worker, which this starts, inherits what is blocked.
+                blocked = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
+                try:
+                    self._making[shard] = self._pool.submit(_make_file, shard, self.path(shard))
+                finally:
+                    signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
 
     def read(self, shard: int) -> Batch:
         """The shard, as soon as it is there.
@@ -121,10 +132,18 @@ class DiskShards:
                                '(is there enough memory?); continue with --resume') from error
 
     def close(self) -> None:
-        """Stop making shards."""
-        if self._pool is not None:
-            self._pool.shutdown(wait=True, cancel_futures=True)
-            self._pool = None
+        """Stop making shards, at once: those that are not complete are lost."""
+        pool, self._pool = self._pool, None
+        self._making.clear()
+        if pool is None:
+            return
+        workers = list(pool._processes.values())
+        for worker in workers:
+            worker.kill()
+        pool.shutdown(wait=True, cancel_futures=True)
+        for worker in workers:
+            for path in self._folder.glob(f'*.{worker.pid}.tmp'):
+                path.unlink()
 
 
 def read_shard(path: Path) -> Batch:
@@ -162,8 +181,6 @@ def _start_worker(open_dataset: Callable[[], Dataset], shard_size: int, root: Pa
     global _worker
     torch.set_num_threads(1)
     keep_freed_memory()
-    for number in (signal.SIGINT, signal.SIGTERM):  # the training run decides when to stop
-        signal.signal(number, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -88,7 +89,9 @@ class Laboratory:
     @cached_property
     def test(self) -> list[Batch]:
         """The test samples."""
-        return first_samples(open_shards(self.recipe, self.machine, 'test', torch.device('cpu')), TEST_SAMPLES)
+        with closing(open_shards(self.recipe, self.machine, 'test', torch.device('cpu'))) as shards:
+            log.info('preparing the test samples (%s)', shards.dataset.name)
+            return first_samples(shards, TEST_SAMPLES)
 
     def result(self, name: str, checkpoint: Checkpoint, iterations: int = 2) -> Result:
         """What a network makes of the test samples, with the refiner of the checkpoint if it has one."""

@@ -8,7 +8,7 @@ import os
 import signal
 import time
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -83,6 +83,7 @@ class Run:
         keep_freed_memory()
         if machine.threads:
             torch.set_num_threads(machine.threads)
+        self._stop = self._waiting = False
         self.device = torch.device(machine.device)
         if self.device.type == 'cuda':
             self.device = torch.device('cuda', int(os.environ.get('LOCAL_RANK', 0)))
@@ -97,12 +98,17 @@ class Run:
         self.steps = -(-self.budget // recipe.batch_size)
 
         # Channels last is what fast convolutions of few channels want, and twice as fast for them on a CPU.
-        objective = self._make_objective().to(self.device)
+        with self._signals(), self._interruptible():
+            try:
+                objective = self._make_objective().to(self.device)
+            except BaseException:
+                self.shards.close()
+                raise
         self.objective = objective.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.averaged = copy.deepcopy(self.objective) if recipe.average else self.objective
         self.optimizer = make_optimizer(recipe, self.objective)
         self.step, self.best_mm = 0, float('inf')
-        self._stop = False
+        self._validated = 0  # step
         self._saved = time.monotonic()
 
     # What is trained, on what
@@ -168,6 +174,23 @@ class Run:
             TrainingError: the folder holds a run already (or none to resume), the loss is not finite any more, or a
                 signal ended the run.
         """
+        with self._signals():
+            try:
+                self._begin(resume)
+                return self._loop(self._distributed())
+            except KeyboardInterrupt:  # between two steps, see `_signals`
+                if not self.step:
+                    raise
+                self._save()
+                if self.rank == 0 and self._validated < self.step:
+                    self._save_checkpoint('last', {})
+                raise TrainingError(f'stopped by a signal after {self.step * self.recipe.batch_size:,} samples; '
+                                    'continue with --resume') from None
+            finally:
+                self.shards.close()
+                self.folder.close()
+
+    def _begin(self, resume: bool) -> None:
         if resume:
             progress = load_state(self.folder.state, self._modules(), self.optimizer)
             self.step, self.best_mm = progress['step'], progress['best_mm'] or float('inf')
@@ -178,12 +201,6 @@ class Run:
         if self.rank == 0:
             self.folder.open()
             log.info('step %s of %s, %s', self.step, self.steps, self.recipe)
-        try:
-            with self._signals():
-                return self._loop(self._distributed())
-        finally:
-            self.shards.close()
-            self.folder.close()
 
     def _loop(self, module: nn.Module) -> dict[str, Any]:
         recipe = self.recipe
@@ -201,9 +218,8 @@ class Run:
                     self.folder.write({'step': self.step, 'samples': done, **values,
                                        'rate': round(bar.format_dict['rate'] or 0, 1),
                                        'learning_rate': self.optimizer.param_groups[0]['lr']})
-                if self._stop:
-                    self._save()
-                    raise TrainingError(f'stopped by a signal after {done:,} samples; continue with --resume')
+                if self._stop and not last:
+                    raise KeyboardInterrupt
                 if last or done // recipe.val_every > (done - recipe.batch_size) // recipe.val_every:
                     result = self._validate()
                     self._save()
@@ -216,7 +232,8 @@ class Run:
         recipe = self.recipe
         for group in self.optimizer.param_groups:
             group['lr'] = learning_rate(recipe, self.step / self.steps)
-        batch, numbers = self.stream.batch(self.step)
+        with self._interruptible():
+            batch, numbers = self.stream.batch(self.step)
         batch = {key: value.to(self.device, non_blocking=True) for key, value in batch.items()}
         batch = augment(batch, recipe.augmentation, numbers, recipe.seed)
         batch['numbers'] = numbers.to(self.device) + (recipe.seed << 41)
@@ -263,15 +280,26 @@ class Run:
 
     @contextmanager
     def _signals(self) -> Iterator[None]:
-        """SIGTERM and Ctrl-C end the run after the step that is under way."""
+        """SIGTERM and Ctrl-C end the run after the step that is under way, or at once while it waits for samples."""
         def stop(*_: Any) -> None:
-            self._stop = True
+            self._stop, waiting, self._waiting = True, self._waiting, False
+            if waiting and self.world == 1:  # several processes stop together, after the same step
+                raise KeyboardInterrupt
         before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
         try:
             yield
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
+
+    @contextmanager
+    def _interruptible(self) -> Iterator[None]:
+        """While samples are waited for, which changes nothing of the run."""
+        self._waiting = True
+        try:
+            yield
+        finally:
+            self._waiting = False
 
     # Validation and files
 
@@ -290,11 +318,13 @@ class Run:
             self.best_mm = result['val_mm']
             self._save_checkpoint('best', result)
         self._save_checkpoint('last', result)
+        self._validated = self.step
         return result
 
     @cached_property
     def _validation(self) -> list[Batch]:
-        return first_samples(open_shards(self.recipe, self.machine, 'val', self.device), self.recipe.val_samples)
+        with closing(open_shards(self.recipe, self.machine, 'val', self.device)) as shards, self._interruptible():
+            return first_samples(shards, self.recipe.val_samples)
 
     def _save_checkpoint(self, name: str, result: dict[str, Any]) -> None:
         metadata = {'skeleton': self.skeleton.name, 'cube_side': CUBE_SIDE, 'validation': result,

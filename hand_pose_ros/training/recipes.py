@@ -137,6 +137,9 @@ def _replace(target: T, keys: list[str], text: str, item: str) -> T:
         value = PRESETS[text]
     else:
         value = _convert(text, fields[key], item)
+        least = 0 if key in ('first_shard', 'last_shard', 'seed') else 1
+        if 'int' in fields[key] and value is not None and value < least:
+            raise HandPoseError(f'--set {item}: must be at least {least}')
     return dataclasses.replace(target, **{key: value})  # type: ignore[type-var]
 
 

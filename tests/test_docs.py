@@ -13,7 +13,7 @@ import pytest
 
 from hand_pose_ros.cli import VERBS, main
 from hand_pose_ros.models import build
-from hand_pose_ros.models.checkpoints import save_checkpoint
+from hand_pose_ros.models.checkpoints import load_checkpoint, save_checkpoint
 from hand_pose_ros.skeleton import SKELETONS
 
 CHECKOUT = Path(__file__).resolve().parents[1]
@@ -139,9 +139,11 @@ def test_parameters_of_networks_are_counted() -> None:
     shown = dict(rows(TEXTS['docs/paper.md'], '| network, 21 joints | parameters |'))
     header = '| | `hand_dense` (default) | `deep_prior` |'
     (models,) = (row[1:] for row in rows(TEXTS['docs/models.md'], header) if row[0] == 'parameters')
-    assert models[1] == shown['deep_prior']
-    for network, count in {**shown, 'hand_dense': models[0]}.items():
-        assert f'{sum(weights.numel() for weights in build(network).parameters()):,}' == count, network
+    sizes = {network: sum(weights.numel() for weights in build(network).parameters()) for network in shown}
+    assert {network: f'{size:,}' for network, size in sizes.items()} == shown
+    shipped = [load_checkpoint(name) for name in ('hand_dense', 'deep_prior', 'deep_prior_orref')]
+    assert models == [f'{sum(part.numel() for net in (c.network, c.refiner) if net for part in net.parameters()):,}'
+                      for c in shipped]
 
 
 def test_skeletons_are_those_of_the_code() -> None:

@@ -93,17 +93,35 @@ class Laboratory:
             log.info('preparing the test samples (%s)', shards.dataset.name)
             return first_samples(shards, TEST_SAMPLES)
 
-    def result(self, name: str, checkpoint: Checkpoint, iterations: int = 2) -> Result:
+    def result(self, name: str, checkpoint: Checkpoint) -> Result:
         """What a network makes of the test samples, with the refiner of the checkpoint if it has one."""
         network, refiner = checkpoint.network, checkpoint.refiner
 
         def predict(patch: torch.Tensor) -> torch.Tensor:
             joints = network(patch)
-            return refiner(patch, joints, iterations=iterations) if refiner is not None else joints
+            return refiner(patch, joints, iterations=2) if refiner is not None else joints
 
         estimates, truths = estimate(predict, self.test, torch.device('cpu'))
         return _result(name, get_skeleton(checkpoint.metadata['skeleton']), estimates, truths,
                        samples=checkpoint.metadata['samples'], dataset=self.recipe.dataset)
+
+    def chain(self, name: str, checkpoint: Checkpoint, count: int) -> list[Result]:
+        """The same after 1 to `count` iterations of the refiner, each of which starts where the one before ended."""
+        network, refiner = checkpoint.network, checkpoint.refiner
+        skeleton = get_skeleton(checkpoint.metadata['skeleton'])
+        assert refiner is not None
+
+        def predict(patch: torch.Tensor) -> torch.Tensor:
+            joints = [network(patch)]
+            for _ in range(count):
+                joints.append(refiner(patch, joints[-1], iterations=1))
+            return torch.cat(joints[1:], dim=1)
+
+        every = list(range(len(skeleton))) * count
+        estimates, truths = (part.unflatten(1, (count, len(skeleton)))
+                             for part in estimate(predict, self.test, torch.device('cpu'), every))
+        return [_result(f'{name} x{i + 1}', skeleton, estimates[:, i], truths[:, i],
+                        samples=checkpoint.metadata['samples'], dataset=self.recipe.dataset) for i in range(count)]
 
     def truth_through(self, width: int, skeleton: Skeleton) -> Result:
         """What principal components of the true poses of the test keep of them: about as good as any network with a
@@ -168,8 +186,7 @@ def refinement(lab: Laboratory) -> str:
     """No refinement, StdRef and ORRef, and the number of iterations (the paper's right figures)."""
     results = [lab.result('deep-30', lab.network('deep', 30))]
     for refiner in ('std_ref', 'or_ref'):
-        checkpoint = lab.refined(refiner)
-        results += [lab.result(f'deep-30 + {refiner} x{i}', checkpoint, i) for i in range(1, ITERATIONS + 1)]
+        results += lab.chain(f'deep-30 + {refiner}', lab.refined(refiner), ITERATIONS)
     twice = [results[0], *(result for result in results if result.name.endswith('x2'))]
     lab.write_results('refinement-curves', twice, plots.curves(twice))
     return lab.write_results('refinement', results, figures.iterations(results))

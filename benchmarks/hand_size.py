@@ -4,8 +4,9 @@
     python benchmarks/hand_size.py --number 60 --start 22000 --frames 24
 
 Every image is read in cubes of 0.30 m, of 0.285 m, and of 0.30 m times the size of the hand over the usual one: the
-true size, the one that the network tells of the first cube, and the average of what it told of the same hand in earlier
-images. Cubes stay within 0.25 to 0.36 m, which networks are trained for, and are centred as tracking would.
+true size, the one that the network tells of the first cube, and the one that the estimator would believe after the
+earlier images of the same hand. Cubes stay within 0.25 to 0.36 m, which networks are trained for, and are centred as
+tracking would.
 """
 
 from __future__ import annotations
@@ -17,15 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hand_pose_ros.estimator import HandPoseEstimator
+from hand_pose_ros.estimator import SIZE_IMAGES, USUAL_SIZE, HandPoseEstimator
 from hand_pose_ros.geometry import Cube, crop
 from hand_pose_ros.skeleton import HAND21
 from hand_pose_ros.synthetic.generator import SyntheticHands
 
-USUAL_M = 0.166
-"""Median length of the synthetic hands, from the wrist along the bones to the tip of the middle finger."""
 CHAIN = [HAND21.joint_names.index(name) for name in ('middle_tip', 'middle_dip', 'middle_pip', 'middle_mcp', 'wrist')]
-CUBES = ('0.30 m', '0.285 m', 'true size', 'own size', 'average')
+CUBES = ('0.30 m', '0.285 m', 'true size', 'own size', 'tracked')
 
 
 def main() -> None:
@@ -56,10 +55,11 @@ def main() -> None:
             center = joints.mean(0) + rng.normal(0, 0.008, 3)
             if args.frames > 1 and (center[2] < 0.1 or _share_inside(camera.project(joints), depth.shape) < 0.5):
                 continue
-            average = np.exp(np.mean(told)) if told else 1.0
-            errors, answer = read([0.30, 0.285, 0.30 * length / USUAL_M, 0.30 * average])
-            told.append(float(answer['size'][0]) + np.log(0.19 / USUAL_M))  # it is over a length of 0.19 m
-            own, _ = read([0.30 * np.exp(told[-1])])
+            tracked = float(np.exp(sum(told) / (len(told) + SIZE_IMAGES)))
+            errors, answer = read([0.30, 0.285, 0.30 * length / USUAL_SIZE, 0.30 * tracked])
+            usual = np.log(0.19 / USUAL_SIZE)  # it is told over a length of 0.19 m in a cube of 0.30 m
+            told.append(float(answer['size'][3]) + usual + np.log(tracked))
+            own, _ = read([0.30 * np.exp(answer['size'][0] + usual)])
             rows.append([length, *errors[:3], *own, errors[3]])
     table = np.array(rows)
     low, high = np.quantile(table[:, 0], [1 / 3, 2 / 3])

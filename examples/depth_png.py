@@ -33,8 +33,8 @@ def main() -> None:
             print(f'  {name:<12}{x:+.3f} {y:+.3f} {z:.3f} m   {confidence:.2f}')
     if not hands:
         print('no hand')
-    if args.picture:
-        cv2.imwrite(args.picture, overlay(depth, intrinsics, hands))
+    if args.picture and not cv2.imwrite(args.picture, overlay(depth, intrinsics, hands)):
+        sys.exit(f'{args.picture} cannot be written: is there such a folder?')
 
 
 if __name__ == '__main__':

@@ -83,12 +83,7 @@ def candidates(depth: NDArray[np.float32], intrinsics: Intrinsics, *, side: floa
         near, far: range in which hands are looked for, metres.
         regions: what lies outside these rectangles does not count; None = the whole image.
     """
-    if regions is not None:
-        inside = np.zeros(depth.shape, bool)
-        for x, y, width, height in regions:
-            inside[max(y, 0):max(y + height, 0), max(x, 0):max(x + width, 0)] = True
-        depth = np.where(inside, depth, np.float32(0))
-    scene = _Scene(depth, intrinsics, near, far)
+    scene = _Scene(within(depth, regions), intrinsics, near, far)
     found: list[Cube] = []
     z, unseen = scene.z, scene.z > 0
     present = z[unseen]
@@ -106,13 +101,23 @@ def candidates(depth: NDArray[np.float32], intrinsics: Intrinsics, *, side: floa
                 continue
             center = _settle(scene, unseen, scene.centroid(z, piece, slice(None), slice(None)), side)
             again = any(np.linalg.norm(center - cube.center) < side / 3 for cube in found)
-            if not again and _may_hold_a_hand(scene, center, side):
+            if not again and _may_hold_a_hand(scene, center, side, MAX_THROUGH):
                 found.append(Cube((float(center[0]), float(center[1]), float(center[2])), side))
                 yield found[-1]
             # Whatever it was, it has been judged: look behind and beside it.
             _, inside, rows, cols = scene.inside(center, side)
             unseen[rows, cols] &= ~inside
             unseen[piece] = False
+
+
+def within(depth: NDArray[np.float32], regions: Sequence[Region] | None) -> NDArray[np.float32]:
+    """A depth image without the readings outside of all regions; None = as it is."""
+    if regions is None:
+        return depth
+    inside = np.zeros(depth.shape, bool)
+    for x, y, width, height in regions:
+        inside[max(y, 0):max(y + height, 0), max(x, 0):max(x + width, 0)] = True
+    return np.where(inside, depth, np.float32(0))
 
 
 def detect(depth: NDArray[np.float32], intrinsics: Intrinsics, *, max_hands: int = 1, **where: Any) -> list[Cube]:
@@ -134,15 +139,18 @@ def _settle(scene: _Scene, unseen: NDArray[np.bool_], center: NDArray[np.float64
     return center
 
 
-def _may_hold_a_hand(scene: _Scene, center: NDArray[np.float64], side: float) -> bool:
+def _may_hold_a_hand(scene: _Scene, center: NDArray[np.float64], side: float, max_through: float) -> bool:
     z, inside, _, _ = scene.inside(center, side)
     if float(np.sum(np.square(z[inside]))) * scene.pixel_area < MIN_CUBE_AREA_M2:
         return False
     through = max(min(inside[0].mean(), inside[-1].mean()), min(inside[:, 0].mean(), inside[:, -1].mean()))
-    return bool(through <= MAX_THROUGH)
+    return bool(through <= max_through)
 
 
 def holds_a_hand(depth: NDArray[np.float32], intrinsics: Intrinsics, cube: Cube, *, near: float = 0.1,
-                 far: float = 1.5) -> bool:
-    """Whether a tracked cube still holds an object that may be a hand: the honest test of being lost."""
-    return _may_hold_a_hand(_Scene(depth, intrinsics, near, far), np.array(cube.center), cube.side)
+                 far: float = 1.5, max_through: float = MAX_THROUGH) -> bool:
+    """Whether a tracked cube still holds an object that may be a hand: the honest test of being lost.
+
+    With `max_through` 1 a table or a wall may go through it, for a network that tells a hand before one from none.
+    """
+    return _may_hold_a_hand(_Scene(depth, intrinsics, near, far), np.array(cube.center), cube.side, max_through)

@@ -6,8 +6,9 @@ next one need not be searched.
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import count
@@ -17,11 +18,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hand_pose_ros.detection import Region, candidates, holds_a_hand
+from hand_pose_ros.detection import MAX_THROUGH, Region, candidates, holds_a_hand
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.geometry import PATCH_SIZE, Cube, Intrinsics, crop
 from hand_pose_ros.models.checkpoints import load_checkpoint
-from hand_pose_ros.runtime import Engine, make_engine
+from hand_pose_ros.runtime import Engine, default_threads, make_engine
+from hand_pose_ros.runtime.finder import Finder
 from hand_pose_ros.scoring import explain, learned
 from hand_pose_ros.skeleton import Skeleton, get_skeleton
 from hand_pose_ros.smoothing import OneEuroFilter
@@ -46,6 +48,12 @@ SIDE_MEMORY = 0.9
 SETTLED = 5.0
 """A side that has shown itself by more than this (logits) is not doubted until that has faded: about every seventh
 image. The scores of networks that do not judge sides never get there."""
+
+
+USUAL_SIZE = 0.166
+"""Metres from the wrist along the bones to the tip of the middle finger, of the hand that a usual cube is for."""
+SIZE_IMAGES = 10
+"""So many images of a hand make half of what it tells of its size believed: a cube that fits is seen better."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +86,14 @@ class _Track:
     id: str
     center: tuple[float, float, float]
     rightness: float = 0.0  # > 0: has looked more like a right hand
+    sizes: float = 0.0  # sum of logarithms of its size over the usual one
+    images: int = 0
     filter: OneEuroFilter | None = None
+
+    @property
+    def scale(self) -> float:
+        """Of its cube."""
+        return float(np.exp(np.clip(self.sizes / (self.images + SIZE_IMAGES), -0.2, 0.2)))
 
 
 @dataclass(frozen=True)
@@ -90,6 +105,7 @@ class _Reading:
     confidence: NDArray[np.float32]
     score: float
     rightness: float = 0.0
+    size: float = 0.0  # logarithm of the hand's over the usual one
 
 
 @dataclass
@@ -99,6 +115,8 @@ class HandPoseEstimator:
     Args:
         engine: runs the network, `patches (N, 1, 128, 128) -> joints (N, J, 3)` in cube units of a right hand.
         skeleton: the joints that the network gives.
+        find: where hands may be, the best place first: `detection.candidates` (the nearest things, as in the paper) or
+            a `runtime.finder.Finder`.
         cube_side: length of the cube's side in metres; the network was trained for about this size.
         side: 'auto' finds out which hand it is; 'left' or 'right' states it.
         max_hands: at most this many hands per image (the node and the command line take 2; evaluation, benchmarks and
@@ -111,6 +129,7 @@ class HandPoseEstimator:
 
     engine: Engine
     skeleton: Skeleton
+    find: Callable[..., Iterable[Cube]] = candidates
     cube_side: float = 0.30
     side: Literal['auto', 'left', 'right'] = 'auto'
     max_hands: int = 1
@@ -132,13 +151,15 @@ class HandPoseEstimator:
 
     @classmethod
     def from_pretrained(cls, model: str | PathLike[str] | None = None, *, device: str = 'auto',
-                        num_threads: int | None = None, **options: Any) -> HandPoseEstimator:
+                        num_threads: int | None = None, detector: Literal['network', 'nearest'] = 'network',
+                        **options: Any) -> HandPoseEstimator:
         """An estimator with trained weights.
 
         Args:
             model: name of weights that ship, or path of a checkpoint; None takes the default.
             device: 'auto', 'cpu', 'cuda' or 'cuda:N'.
-            num_threads: for the network on the CPU; None chooses by the number of cores.
+            num_threads: for the networks on the CPU; None chooses by the number of cores.
+            detector: how hands are found: by a network of their own, or as in the paper, as what is nearest.
             options: the other arguments of the class.
 
         Raises:
@@ -147,6 +168,8 @@ class HandPoseEstimator:
         checkpoint = load_checkpoint(model)
         engine = make_engine(checkpoint.network, device=device, num_threads=num_threads, refiner=checkpoint.refiner)
         options.setdefault('cube_side', checkpoint.metadata['cube_side'])
+        if detector == 'network':
+            options.setdefault('find', Finder.from_pretrained(num_threads=num_threads or default_threads()))
         return cls(engine, get_skeleton(checkpoint.metadata['skeleton']), metadata=checkpoint.metadata, **options)
 
     def warm_up(self) -> None:
@@ -184,9 +207,10 @@ class HandPoseEstimator:
 
         hands: list[HandEstimate] = []
         for track in list(self._tracks):
-            cube = Cube(track.center, self.cube_side)
+            cube = Cube(track.center, self.cube_side * track.scale)
             with self._timed('detect'):
-                alive = holds_a_hand(depth, intrinsics, cube, near=self.near, far=self.far)
+                alive = holds_a_hand(depth, intrinsics, cube, near=self.near, far=self.far,
+                                     max_through=1 if 'hand' in self.engine.outputs else MAX_THROUGH)
             reading = self._read(depth, intrinsics, cube, track) if alive else None
             if reading is not None and reading.score >= self.min_score and not _overlaps(reading.cube, hands):
                 hands.append(self._follow(track, reading, dt))
@@ -210,7 +234,9 @@ class HandPoseEstimator:
         if len(hands) >= self.max_hands or (hands and self._since_search < SEARCH_EVERY):
             return
         self._since_search, alarms = 0, 1 if hands else FALSE_ALARMS
-        cubes = candidates(depth, intrinsics, side=self.cube_side, near=self.near, far=self.far, regions=regions)
+        with self._timed('detect'):
+            cubes = iter(self.find(depth, intrinsics, side=self.cube_side, near=self.near, far=self.far,
+                                   regions=regions))
         # Objects that prove to be no hand must not hide one behind them, nor cost time without end.
         while alarms > 0 and len(hands) < self.max_hands:
             with self._timed('detect'):
@@ -262,7 +288,10 @@ class HandPoseEstimator:
             coordinates = answer['joints'][shown].astype(np.float64)
             if mirrored[shown]:
                 coordinates[:, 0] *= -1
-            return _Reading(cube, cube.from_cube(coordinates), confidence[shown], float(score[shown]), rightness)
+            size = 0.0
+            if 'size' in answer:  # over 0.19 m in a cube of 0.30 m, see `training.objectives`
+                size = float(answer['size'][shown]) + math.log(0.19 / 0.30 * cube.side / USUAL_SIZE)
+            return _Reading(cube, cube.from_cube(coordinates), confidence[shown], float(score[shown]), rightness, size)
 
     def _mirrorings(self, track: _Track) -> tuple[bool, ...]:
         """The network knows right hands: a left one is shown to it in the mirror, and of an unknown one, both."""
@@ -285,6 +314,7 @@ class HandPoseEstimator:
 
     def _follow(self, track: _Track, reading: _Reading, dt: float) -> HandEstimate:
         track.rightness = SIDE_MEMORY * track.rightness + reading.rightness
+        track.sizes, track.images = track.sizes + reading.size, track.images + 1
         center = reading.joints.mean(axis=0)
         track.center = (float(center[0]), float(center[1]), float(center[2]))
         joints = reading.joints

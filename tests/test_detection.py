@@ -89,6 +89,7 @@ def test_a_tracked_cube_is_lost_when_the_hand_is_gone(empty):
     assert holds_a_hand(empty, CAMERA, cube)
     empty[:] = 0.5
     assert not holds_a_hand(empty, CAMERA, cube)
+    assert holds_a_hand(empty, CAMERA, cube, max_through=1)  # for a network that can tell
 
 
 def test_every_annotated_real_hand_is_found(shared_data):

@@ -187,7 +187,7 @@ def test_build_remembers_everything_that_made_the_network():
     network = build('deep_prior', joints=14)
     assert network.architecture == 'deep_prior'
     assert network.config == {'joints': 14, 'bottleneck': 30, 'dropout': 0.3}
-    assert set(POSE_NETWORKS) | set(REFINERS) | {'center_refiner'} == set(ARCHITECTURES)
+    assert set(POSE_NETWORKS) | set(REFINERS) | {'center_refiner', 'hand_finder'} == set(ARCHITECTURES)
 
 
 def test_the_center_refiner_sees_fine_the_middle_and_coarsely_the_rest():

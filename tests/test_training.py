@@ -469,6 +469,24 @@ def test_the_center_refiner_learns_where_the_palm_is(folder, tmp_path):
     assert error < 0.5 * (palm - palm.mean(0)).norm(dim=-1).mean()
 
 
+def test_the_finder_of_hands_learns_from_whole_scenes(folder, tmp_path):
+    recipe = get_recipe('finder', ['samples=1920', 'batch_size=16', 'shard_size=32', 'reuse=60', 'val_samples=32',
+                                   'precision=float32', 'options.width=8', 'learning_rate=0.01', 'average=0.9'])
+    run = Run(tmp_path / 'run', recipe, Machine(tmp_path / 'cache', workers=0))
+    run.train()
+    terms = [row for row in map(json.loads, (tmp_path / 'run' / 'metrics.jsonl').open()) if 'score' in row]
+    network = load_checkpoint(tmp_path / 'run' / 'last.safetensors').network
+    shown = run.shards.read(0)
+    with torch.no_grad():
+        logits, middles = network(shown['patch'].float())
+    best = logits.flatten(1).argmax(1)
+    found = middles.flatten(2)[torch.arange(len(best)), :, best]
+    off = (found - shown['joints'][:, 0])[shown['hand_present']].norm(dim=1)
+    assert terms and off.median() < 0.15  # of scenes that reach half a metre to each side
+    with pytest.raises(TrainingError, match='dataset=scenes'):
+        tiny(folder, 'network=hand_finder', 'options={}', out=tmp_path / 'never')
+
+
 def test_a_network_starts_from_another_and_gets_a_prior_if_that_had_none(folder, tmp_path):
     plain = tmp_path / 'plain.safetensors'
     facts = {'skeleton': 'icvl16', 'cube_side': 0.3}

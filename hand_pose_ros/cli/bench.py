@@ -194,9 +194,11 @@ def _frame_rows(model: str | None, threads: int, rounds: int) -> dict[str, dict[
     from hand_pose_ros.estimator import HandPoseEstimator
     from hand_pose_ros.models import build
     from hand_pose_ros.runtime import make_engine
+    from hand_pose_ros.runtime.finder import Finder
     from hand_pose_ros.skeleton import HAND21
 
     depth, intrinsics = _vga_frame()
+    finder = Finder.from_pretrained(num_threads=threads)
     units = to_units(depth)
 
     def estimator(architecture: str, refiner: str | None = None, **options: Any) -> HandPoseEstimator:
@@ -206,7 +208,8 @@ def _frame_rows(model: str | None, threads: int, rounds: int) -> dict[str, dict[
 
     estimators = {
         'deep_prior': estimator('deep_prior'), 'deep_prior, searching': estimator('deep_prior', tracking=False),
-        'deep_prior + or_ref x2': estimator('deep_prior', 'or_ref'), 'hand_dense': estimator('hand_dense')}
+        'deep_prior + or_ref x2': estimator('deep_prior', 'or_ref'), 'hand_dense': estimator('hand_dense'),
+        'hand_dense, searching': estimator('hand_dense', tracking=False, find=finder)}
     if model:
         estimators[model] = HandPoseEstimator.from_pretrained(model, device='cpu', num_threads=threads)
     stages: dict[str, list[float]] = {}

@@ -15,7 +15,7 @@ EPILOG = """examples:
   hand-pose train --out runs/modern --resume
   torchrun --standalone --nproc-per-node 4 --no-python hand-pose train modern --out runs/m --device cuda --workers 0
 
-recipes: paper, original-code, modern. docs/training.md says what they do, training/recipes.py lists the keys.
+recipes: paper, original-code, modern, finder. docs/training.md says what they do, training/recipes.py lists the keys.
 """
 
 
@@ -25,7 +25,8 @@ def add_parser(subparsers: Any) -> None:
         description='Train a network from a recipe, on synthetic hands or a recorded dataset. This may take hours: '
                     'Ctrl-C stops\nafter the current step and leaves weights to use, and --resume goes on from there.',
         formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('recipe', nargs='?', help='paper, original-code or modern (with --resume: that of the run)')
+    parser.add_argument('recipe', nargs='?',
+                        help='paper, original-code, modern or finder (with --resume: that of the run)')
     parser.add_argument('--out', type=Path, required=True, metavar='RUN', help='folder of the run')
     parser.add_argument('--resume', action='store_true', help='continue the run in RUN')
     add_machine_arguments(parser)

@@ -8,7 +8,7 @@ from hand_pose_ros.datasets.base import Batch, Dataset, DatasetError, joints_in_
 
 __all__ = ['DATASETS', 'Batch', 'Dataset', 'DatasetError', 'joints_in_metres', 'open_dataset']
 
-DATASETS = ('synthetic', 'nyu', 'icvl', 'msra', 'bags')
+DATASETS = ('synthetic', 'scenes', 'nyu', 'icvl', 'msra', 'bags')
 
 
 def open_dataset(name: str, split: str, root: Path | None = None, device: str = 'cpu') -> Dataset:
@@ -16,7 +16,8 @@ def open_dataset(name: str, split: str, root: Path | None = None, device: str = 
 
     Args:
         name: one of `DATASETS`; 'msra:P3' leaves out the subject P3; 'synthetic:without-surface' trains on hands that
-            lack this ingredient (see `hand_pose_ros.synthetic.stages.Ingredients`), or with 'everything' all of them.
+            lack this ingredient (see `hand_pose_ros.synthetic.stages.Ingredients`), or with 'everything' all of them;
+            'scenes' are whole images of the same scenes, for `hand_finder`.
         split: 'train', 'val' or 'test'; nyu and icvl also have 'test_1' and 'test_2'.
         root: folder of a recorded dataset.
         device: where synthetic hands are rendered.
@@ -30,6 +31,9 @@ def open_dataset(name: str, split: str, root: Path | None = None, device: str = 
     if kind == 'synthetic':
         from hand_pose_ros.datasets.synthetic import Synthetic
         return Synthetic(split, device, variant)
+    if kind == 'scenes':
+        from hand_pose_ros.datasets.synthetic import SyntheticScenes
+        return SyntheticScenes(split, device)
     if root is None:
         raise DatasetError(f'{name} is read from disk: give its folder with --set root=FOLDER')
     if kind == 'nyu':

@@ -19,6 +19,7 @@ from functools import partial
 from pathlib import Path
 
 import torch
+from filelock import FileLock
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
@@ -194,12 +195,14 @@ def _start_worker(open_dataset: Callable[[], Dataset], shard_size: int, root: Pa
 
 def _make_file(shard: int, path: Path) -> None:
     dataset, shard_size, root, limit = _worker
-    if path.exists():  # another run was faster
-        return
-    tensors = {key: value.cpu().contiguous() for key, value in make_shard(dataset, shard, shard_size).items()}
-    temporary = path.with_suffix(f'.{os.getpid()}.tmp')
-    save_file(tensors, temporary, metadata={'sha256': _checksum(tensors)})
-    os.replace(temporary, path)
+    # The processes of a run under torchrun all ask for the same shards: who waits here finds one made, and goes on.
+    with FileLock(path.with_suffix('.lock')):
+        if path.exists():
+            return
+        tensors = {key: value.cpu().contiguous() for key, value in make_shard(dataset, shard, shard_size).items()}
+        temporary = path.with_suffix(f'.{os.getpid()}.tmp')
+        save_file(tensors, temporary, metadata={'sha256': _checksum(tensors)})
+        os.replace(temporary, path)
     _limit_size(root, limit)
 
 

@@ -1,4 +1,4 @@
-"""Rendered hands: `hand_pose_ros.synthetic` seen as a dataset without an end."""
+"""Rendered hands, and whole scenes with hands: `hand_pose_ros.synthetic` seen as datasets without an end."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from torch import Tensor
 import hand_pose_ros.synthetic
 from hand_pose_ros.datasets.base import Batch, Dataset, DatasetError
 from hand_pose_ros.errors import HandPoseError
+from hand_pose_ros.models.finder import FOCAL
 from hand_pose_ros.skeleton import HAND21
 from hand_pose_ros.synthetic.stages import Ingredients
 
@@ -52,10 +53,7 @@ class Synthetic(Dataset):
                                          ingredients=ingredients)
         except HandPoseError as error:
             raise DatasetError(f'synthetic: {error}') from error
-        # Any change of the code that makes the samples makes other samples.
-        sources = sorted(Path(hand_pose_ros.synthetic.__path__[0]).glob('*.py'))
-        code = hashlib.sha256(b''.join(path.read_bytes() for path in sources)).hexdigest()
-        self.fingerprint = f'{self.name}-{self.device.type}-{code[:12]}'
+        self.fingerprint = f'{self.name}-{self.device.type}-{_code()}'
 
     def batch(self, indices: Tensor) -> Batch:
         hands = self._hands.batch(indices.to(self.device))
@@ -64,6 +62,47 @@ class Synthetic(Dataset):
         center = hands['cube_center'] * torch.stack([mirror, torch.ones_like(mirror), torch.ones_like(mirror)], dim=-1)
         return {'patch': hands['patch'], 'joints': hands['joints'], 'cube_center': center,
                 'cube_side': hands['cube_side'], 'hand_present': hands['hand_present']}
+
+
+class SyntheticScenes(Dataset):
+    """Whole images of the same scenes, for `hand_finder`, of 160 x 128 pixels.
+
+    `patch` (B, 1, 128, 160) is depth in metres, 0 = no reading; `joints` (B, 2, 3) are the middles of one or two hands,
+    in a cube of 2 m whose centre is 1 m before a camera that looks through the middle of the image: x / z, y / z and
+    z - 1; `shown` (B, 2) tells whether that hand is there. `hand_present` is the same of the first.
+
+    Raises:
+        DatasetError: an unknown split.
+    """
+
+    WIDTH, HEIGHT = 160, 128
+    skeleton = HAND21
+    size = None
+
+    def __init__(self, split: str, device: str = 'cpu') -> None:
+        from hand_pose_ros.synthetic.generator import SyntheticHands
+        self.name = f'scenes-{split}'
+        self.device = torch.device(device)
+        try:
+            self._hands = SyntheticHands(split, device=device)
+        except HandPoseError as error:
+            raise DatasetError(f'scenes: {error}') from error
+        self.fingerprint = f'{self.name}-{self.device.type}-{_code()}'
+
+    def batch(self, indices: Tensor) -> Batch:
+        scenes = self._hands.scenes(indices.to(self.device), FOCAL, self.WIDTH, self.HEIGHT)
+        u, v, z = scenes['hands'].unbind(-1)
+        middles = torch.stack([(u - (self.WIDTH - 1) / 2) / FOCAL, (v - (self.HEIGHT - 1) / 2) / FOCAL, z - 1], dim=-1)
+        shown, number = scenes['shown'], len(indices)
+        return {'patch': scenes['depth'][:, None], 'joints': torch.where(shown[..., None], middles, 0), 'shown': shown,
+                'cube_center': torch.tensor([[0.0, 0.0, 1.0]], device=self.device).repeat(number, 1),
+                'cube_side': torch.full((number,), 2.0, device=self.device), 'hand_present': shown[:, 0]}
+
+
+def _code() -> str:
+    """Any change of the code that makes the samples makes other samples."""
+    sources = sorted(Path(hand_pose_ros.synthetic.__path__[0]).glob('*.py'))
+    return hashlib.sha256(b''.join(path.read_bytes() for path in sources)).hexdigest()[:12]
 
 
 def _ingredients(variant: str) -> Ingredients | None:

@@ -11,6 +11,7 @@ from torch import nn
 
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.models.dense import HandDense
+from hand_pose_ros.models.finder import HandFinder
 from hand_pose_ros.models.prior_net import CenterRefiner, Deep, MultiScale, Shallow
 from hand_pose_ros.models.refiner import ORRef, StdRef
 from hand_pose_ros.models.resnet import ResNet
@@ -23,6 +24,7 @@ ARCHITECTURES: dict[str, Callable[..., nn.Module]] = {
     'resnet': ResNet,
     'hand_dense': HandDense,
     'center_refiner': CenterRefiner,
+    'hand_finder': HandFinder,
     'std_ref': StdRef,
     'or_ref': ORRef,
 }
@@ -32,7 +34,8 @@ def build(architecture: str, **config: Any) -> nn.Module:
     """A network with fresh weights, by name; it remembers its `architecture` and its complete `config`.
 
     Pose networks map patches (B, 1, 128, 128) to joints (B, J, 3) in cube units; std_ref and or_ref map patches and
-    joints to better joints; center_refiner maps patches to the palm (B, 3).
+    joints to better joints; center_refiner maps patches to the palm (B, 3); hand_finder maps whole images to the
+    middles of hands.
 
     Raises:
         HandPoseError: no such architecture, or a value in `config` that it does not take.

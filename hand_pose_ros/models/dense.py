@@ -81,11 +81,11 @@ class HandDense(nn.Module):
         super().__init__()
         self.joints = joints
         w = width
-        self.stem = nn.Sequential(_conv_norm(1, w, 5, stride=2), nn.ReLU(), nn.MaxPool2d(2))
-        self.stages = nn.ModuleList([_Residual(w, w, 1), _Residual(w, 2 * w, 2),
-                                     _Residual(2 * w, 4 * w, 2), _Residual(4 * w, 8 * w, 2)])
+        self.stem = nn.Sequential(conv_norm(1, w, 5, stride=2), nn.ReLU(), nn.MaxPool2d(2))
+        self.stages = nn.ModuleList([Residual(w, w, 1), Residual(w, 2 * w, 2),
+                                     Residual(2 * w, 4 * w, 2), Residual(4 * w, 8 * w, 2)])
         self.laterals = nn.ModuleList(nn.Conv2d(k * w, 2 * w, 1) for k in (1, 2, 4, 8))
-        self.fuse = nn.Sequential(_conv_norm(2 * w, 2 * w, 3), nn.ReLU())
+        self.fuse = nn.Sequential(conv_norm(2 * w, 2 * w, 3), nn.ReLU())
         self.maps = nn.Conv2d(2 * w, 4 * joints, 1)
         self.summary = plain_linear(8 * w + joints, joints + 3)
         self.head = PriorOverVotes(joints, bottleneck) if bottleneck else None
@@ -137,19 +137,19 @@ class HandDense(nn.Module):
         }
 
 
-class _Residual(nn.Module):
+class Residual(nn.Module):
     """Two 3x3 convolutions beside the identity, or beside a 1x1 projection where the shape changes (He et al. 2016)."""
 
     def __init__(self, inputs: int, outputs: int, stride: int) -> None:
         super().__init__()
-        self.body = nn.Sequential(_conv_norm(inputs, outputs, 3, stride), nn.ReLU(), _conv_norm(outputs, outputs, 3))
-        self.shortcut = nn.Identity() if inputs == outputs else _conv_norm(inputs, outputs, 1, stride)
+        self.body = nn.Sequential(conv_norm(inputs, outputs, 3, stride), nn.ReLU(), conv_norm(outputs, outputs, 3))
+        self.shortcut = nn.Identity() if inputs == outputs and stride == 1 else conv_norm(inputs, outputs, 1, stride)
 
     def forward(self, x: Tensor) -> Tensor:
         return F.relu(self.body(x) + self.shortcut(x))
 
 
-def _conv_norm(inputs: int, outputs: int, size: int, stride: int = 1) -> nn.Sequential:
+def conv_norm(inputs: int, outputs: int, size: int, stride: int = 1) -> nn.Sequential:
     convolution = nn.Conv2d(inputs, outputs, size, stride, padding=size // 2, bias=False)
     nn.init.kaiming_normal_(convolution.weight, nonlinearity='relu')
     return nn.Sequential(convolution, nn.BatchNorm2d(outputs))

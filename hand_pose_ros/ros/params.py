@@ -59,10 +59,11 @@ class Params:
     max_hands: int = _parameter(2, 'At most this many hands per image. While there are fewer, every fifth image takes '
                                 'longer, for it is searched for more.', low=1, high=8)
     min_score: float = _parameter(0.4, 'Hands with a lower score are not reported.', low=0.0, high=1.0)
-    detector: str = _parameter('nearest', 'Where new hands are looked for: at what is nearest to the camera, or within '
-                               'the newest region of hand/region (sensor_msgs/RegionOfInterest, in pixels of the '
-                               'depth image; one without width or height says that there is no hand).',
-                               choices=('nearest', 'region'), fixed=_CONFIGURED)
+    detector: str = _parameter('network', 'How new hands are found: by a small network; as what is nearest to the '
+                               'camera, as in the paper; or by the network within the newest region of hand/region '
+                               '(sensor_msgs/RegionOfInterest, in pixels of the depth image; one without width or '
+                               'height says that there is no hand).',
+                               choices=('network', 'nearest', 'region'), fixed=_CONFIGURED)
     tracking: bool = _parameter(True, 'Look first where the hands of the last image were.')
     smoothing: float = _parameter(0.0, 'Cutoff in Hz of the filter on the joints of a hand at rest; 0 = none.',
                                   low=0.0, high=30.0)
@@ -110,7 +111,8 @@ class Params:
             HandPoseError: there are no such weights, or no such device.
         """
         estimator = HandPoseEstimator.from_pretrained(
-            self.model or None, device=self.device, num_threads=self.num_threads or None)
+            self.model or None, device=self.device, num_threads=self.num_threads or None,
+            detector='nearest' if self.detector == 'nearest' else 'network')
         estimator.warm_up()
         return estimator
 

@@ -21,7 +21,7 @@ TRANSPORTS = ('compressedDepth', 'compressed')
 """Besides raw, the better one first; each is a topic below that of the image."""
 
 NO_REGION = (f'no region arrived on {REGION}, so no hand is looked for: publish where it is in the depth image, or set '
-             'the parameter detector to nearest')
+             'the parameter detector to network')
 
 
 def input_topics(node: Node, transport: str) -> tuple[str, str]:

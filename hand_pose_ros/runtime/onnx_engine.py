@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import onnxruntime
 import torch
+from torch import Tensor, nn
 
 from hand_pose_ros.geometry import PATCH_SIZE
 from hand_pose_ros.runtime.engine import Array, Engine, Pipeline
@@ -19,38 +20,48 @@ OPSET = 17
 
 
 def export(pipeline: Pipeline) -> bytes:
-    """The pipeline as an ONNX model with any number of patches.
+    """The pipeline as an ONNX model with any number of patches."""
+    example = torch.zeros(2, 1, PATCH_SIZE, PATCH_SIZE)
+    return to_onnx(pipeline, example, 'patches', {name: {0: 'batch'} for name in ('patches', *pipeline.outputs)})
+
+
+def to_onnx(module: nn.Module, example: Tensor, name: str, axes: dict[str, dict[int, str]]) -> bytes:
+    """A module with one input `name` as an ONNX model; `axes` names the free dimensions of the input, then of all
+    outputs.
 
     By tracing: the exporter that every supported release of PyTorch has, and that needs no onnxscript.
     """
-    example = torch.zeros(2, 1, PATCH_SIZE, PATCH_SIZE)
-    batch = {name: {0: 'batch'} for name in ('patches', *pipeline.outputs)}
     # Releases before 2.5 know no other exporter, and not the argument that chooses it.
     choice: dict[str, Any] = {'dynamo': False} if 'dynamo' in inspect.signature(torch.onnx.export).parameters else {}
     with TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter('ignore')
         path = Path(folder) / 'network.onnx'
-        torch.onnx.export(pipeline, (example,), str(path), opset_version=OPSET, input_names=['patches'],
-                          output_names=list(pipeline.outputs), dynamic_axes=batch, **choice)
+        torch.onnx.export(module, (example,), str(path), opset_version=OPSET, input_names=[name],
+                          output_names=[output for output in axes if output != name], dynamic_axes=axes, **choice)
         return path.read_bytes()
 
 
+def open_session(model: bytes, num_threads: int) -> onnxruntime.InferenceSession:
+    """A session on `num_threads` threads of the CPU, of which the caller's is one."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = num_threads
+    options.inter_op_num_threads = 1
+    # Threads that spin between images would take whole cores from the rest of the robot, and wherever cores are
+    # shared they slow the network itself down: docs/performance.md.
+    options.add_session_config_entry('session.intra_op.allow_spinning', '0')
+    # Errors come as exceptions; warnings about the graph are of no use to who runs it.
+    options.log_severity_level = 3
+    return onnxruntime.InferenceSession(model, options, providers=['CPUExecutionProvider'])
+
+
 class OnnxEngine(Engine):
-    """A session of ONNX Runtime on `num_threads` threads, of which the caller's is one."""
+    """A session of ONNX Runtime."""
 
     name = 'onnxruntime'
 
     def __init__(self, pipeline: Pipeline, num_threads: int) -> None:
         self.outputs = pipeline.outputs
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = num_threads
-        options.inter_op_num_threads = 1
-        # Threads that spin between images would take whole cores from the rest of the robot, and wherever cores are
-        # shared they slow the network itself down: docs/performance.md.
-        options.add_session_config_entry('session.intra_op.allow_spinning', '0')
-        # Errors come as exceptions; warnings about the graph are of no use to who runs it.
-        options.log_severity_level = 3
-        self.session = onnxruntime.InferenceSession(export(pipeline), options, providers=['CPUExecutionProvider'])
+        self.session = open_session(export(pipeline), num_threads)
 
     def _run(self, patches: Array) -> list[Array]:
         return self.session.run(None, {'patches': np.ascontiguousarray(patches)})

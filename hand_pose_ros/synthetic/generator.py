@@ -23,7 +23,7 @@ from hand_pose_ros.synthetic.renderer import View, depth_of, dot
 from hand_pose_ros.synthetic.rng import Random
 from hand_pose_ros.synthetic.scenes import Scene
 from hand_pose_ros.synthetic.sensors import SENSORS, get_sensor, sense
-from hand_pose_ros.synthetic.stages import CROP, CUBE_SIDE, Ingredients, Motion, Stage, Stages
+from hand_pose_ros.synthetic.stages import CROP, CUBE_SIDE, WINDOW_AT, Ingredients, Motion, Stage, Stages
 
 SPLITS = ('train', 'val', 'test')
 LEFT, RIGHT = 1, 2  # as in the message HandJoints
@@ -99,6 +99,48 @@ class SyntheticHands:
                 'joints_m': torch.where(there, scene.joints * flip[:, None], 0), 'cube_center': center * flip,
                 'cube_side': side, 'visible': visible, 'hand_present': present,
                 'side': torch.where(stage.mirrored, LEFT, RIGHT), 'sensor': stage.sensor}
+
+    @torch.no_grad()
+    def scenes(self, indices: Tensor, focal: float, width: int, height: int) -> dict[str, Tensor]:
+        """Images of the whole scene of each sample (B,), thinned out to a focal length in pixels.
+
+        An image is a window of width x height pixels somewhere over the sensor's image, which may be smaller.
+
+        Returns:
+            depth: (B, height, width) metres, 0 = no reading or beside the sensor's image.
+            hands: (B, 2, 3) the middle of the hand and of a second one: column, row, metres.
+            shown: (B, 2) bool, whether that hand is there and its middle in the image.
+        """
+        indices = indices.to(self.device, torch.int64)
+        parts = [self._scenes(self._first_seed + some, focal, width, height) for some in indices.split(self.chunk)]
+        return {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
+
+    def _scenes(self, seeds: Tensor, focal: float, width: int, height: int) -> dict[str, Tensor]:
+        stage = self._stages.build(seeds)
+        scale = focal / stage.camera()[0]
+        fx, fy, cx, cy, columns, rows = stage.camera(scale)
+        rng = Random(seeds).fork(WINDOW_AT)
+        left = ((columns - width) * rng.fork(0).uniform()).round()
+        top = ((rows - height) * rng.fork(1).uniform()).round()
+        view = View(fx, fy, cx - left, cy - top, height, width)
+        clean, _ = self._stages.draw(stage, view)
+        across = torch.arange(width, device=self.device) + left[:, None]
+        down = torch.arange(height, device=self.device) + top[:, None]
+        inside = (((across >= 0) & (across < columns[:, None]))[:, None, :]
+                  & ((down >= 0) & (down < rows[:, None]))[:, :, None])
+        depth = self._sense(stage, torch.where(inside, clean, 0), view)
+        middles = torch.stack([stage.scene.joints.mean(1), torch.zeros_like(stage.position)], 1)
+        there = torch.stack([stage.scene.present, torch.zeros_like(stage.scene.present)], 1)
+        if (others := stage.scene.others) is not None:
+            middles[others.samples, 1] = self._stages.middles(others.vertices)
+            there[others.samples, 1] = True
+        u, v = view.project(middles)
+        at = torch.stack([u, v, middles[..., 2]], -1)
+        at_pixel = (torch.arange(len(seeds), device=self.device)[:, None], v.round().long().clamp(0, height - 1),
+                    u.round().long().clamp(0, width - 1))
+        shown = (there & (u > 0) & (u < width - 1) & (v > 0) & (v < height - 1) & (middles[..., 2] > 0)
+                 & inside[at_pixel])
+        return {'depth': depth, 'hands': torch.where(shown[..., None], at, 0), 'shown': shown}
 
     def _sense(self, stage: Stage, clean: Tensor, view: View, frame: int = 0) -> Tensor:
         if not self.ingredients.noise:

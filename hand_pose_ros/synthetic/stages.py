@@ -31,7 +31,8 @@ _NEGATIVES = 0.05  # share of samples without a hand
 _FOREARM = 6  # as a part of the skin
 _SECOND_HAND = 0.08  # share of samples with another hand nearby
 
-_SHAPE, _POSE, _VIEW, _CAMERA, _FURNITURE, _SECOND, CROP, _MOTION, _PAST = range(9)  # streams of random numbers
+# Streams of random numbers.
+_SHAPE, _POSE, _VIEW, _CAMERA, _FURNITURE, _SECOND, CROP, _MOTION, _PAST, WINDOW_AT = range(10)
 
 
 @dataclass(frozen=True)
@@ -204,6 +205,10 @@ class Stages:
         mirror = torch.cat([mirror, torch.ones_like(mirror), torch.ones_like(mirror)], 2)
         placed, _ = scenes.place(vertices * mirror, joints * mirror, rotation, position)
         stage.scene.others = scenes.Others(placed, chosen, left)
+
+    def middles(self, vertices: Tensor) -> Tensor:
+        """(B, 3), about where the joints of hands with this skin (B, V, 3) have their mean."""
+        return vertices[:, self._hand.vertex_part != _FOREARM].mean(1)
 
     def detect(self, stage: Stage, elsewhere: Tensor) -> Tensor:
         """Where the product's detector settles, (B, 3) in metres, found in a coarse image around the hand.

@@ -28,7 +28,13 @@ from hand_pose_ros.models.checkpoints import Checkpoint, load_checkpoint, save_c
 from hand_pose_ros.models.prior import fit_prior
 from hand_pose_ros.training.augmentation import augment
 from hand_pose_ros.training.folder import RunFolder, TrainingError
-from hand_pose_ros.training.objectives import CenterObjective, DenseObjective, PoseObjective, RefinerObjective
+from hand_pose_ros.training.objectives import (
+    CenterObjective,
+    DenseObjective,
+    FinderObjective,
+    PoseObjective,
+    RefinerObjective,
+)
 from hand_pose_ros.training.optimizers import learning_rate, make_optimizer
 from hand_pose_ros.training.recipes import EPOCH_OF_ENDLESS_DATA, Recipe, recipe_to_dict
 from hand_pose_ros.training.state import load_state, save_state, save_tensors
@@ -36,6 +42,8 @@ from hand_pose_ros.training.stream import SampleStream
 from hand_pose_ros.training.validation import estimate, first_samples
 
 log = logging.getLogger(__name__)
+
+_OF_NO_JOINTS: dict[str, type[PoseObjective]] = {'center_refiner': CenterObjective, 'hand_finder': FinderObjective}
 
 CUBE_SIDE = 0.30
 """Metres; what a checkpoint recommends to whoever runs it."""
@@ -130,8 +138,11 @@ class Run:
             if base is None:
                 raise TrainingError('a refiner needs the checkpoint that it corrects: --set base=FILE')
             return RefinerObjective(build(recipe.refiner, joints=joints), base.network, recipe, self.skeleton)
-        center = recipe.network == 'center_refiner'
-        network = build(recipe.network, **({} if center else {'joints': joints}), **recipe.options)
+        of_joints = recipe.network not in _OF_NO_JOINTS
+        if (recipe.network == 'hand_finder') != (recipe.dataset == 'scenes'):
+            raise TrainingError(f'{recipe.network} cannot learn from {recipe.dataset}: hand_finder, and nothing else, '
+                                'is trained with dataset=scenes')
+        network = build(recipe.network, **({'joints': joints} if of_joints else {}), **recipe.options)
         bottleneck = recipe.options.get('bottleneck')
         has_prior = base is not None and self._start_from(network, base)
         if bottleneck and not has_prior:
@@ -140,7 +151,8 @@ class Run:
             log.info('the prior keeps %.2f %% of the variance of the poses', 100 * prior.explained_variance_ratio.sum())
         if bottleneck and not recipe.train_prior:
             network.head.reconstruction.requires_grad_(False)  # type: ignore[union-attr]
-        kind = CenterObjective if center else DenseObjective if hasattr(network, 'forward_full') else PoseObjective
+        dense = hasattr(network, 'forward_full')
+        kind = _OF_NO_JOINTS.get(recipe.network, DenseObjective if dense else PoseObjective)
         return kind(network, recipe, self.skeleton)
 
     def _start_from(self, network: nn.Module, base: Checkpoint) -> bool:
@@ -185,7 +197,7 @@ class Run:
                 if self.rank == 0 and self._validated < self.step:
                     self._save_checkpoint('last', {})
                 raise TrainingError(f'stopped by a signal after {self.step * self.recipe.batch_size:,} samples; '
-                                    'continue with --resume') from None
+                                    'continue with --resume (an experiment: with the same command)') from None
             finally:
                 self.shards.close()
                 self.folder.close()
@@ -262,7 +274,9 @@ class Run:
         decay = min(self.recipe.average, (1 + self.step) / (10 + self.step))  # the random start is forgotten soon
         torch._foreach_lerp_(list(self.averaged.parameters()), list(self.objective.parameters()), 1 - decay)
         for mine, theirs in zip(self.averaged.buffers(), self.objective.buffers(), strict=True):
-            mine.copy_(theirs)
+            # The running statistics of the last ten batches are those of the last weights, and noisy: averaged ones
+            # are worth millimetres while the learning rate is high.
+            mine.lerp_(theirs, 1 - decay) if mine.is_floating_point() else mine.copy_(theirs)
 
     def _fail(self, batch: Batch, terms: dict[str, Tensor]) -> None:
         path = self.folder.path / f'failed_batch_{self.step}_{self.rank}.safetensors'

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from hand_pose_ros.datasets import Batch, joints_in_metres
 from hand_pose_ros.models.dense import encode
+from hand_pose_ros.models.finder import CELL, FOCAL, cell_rays
 from hand_pose_ros.skeleton import Skeleton
 from hand_pose_ros.synthetic.rng import Random
 from hand_pose_ros.training.losses import Terms, joint_loss
@@ -92,6 +93,54 @@ class DenseObjective(PoseObjective):
         }
         return {'joints': joint_loss(self.recipe.loss, self.recipe.knee, joints, truth, counts),
                 **{name: _WEIGHTS[name] * value.mean() for name, value in extra.items()}}
+
+
+class FinderObjective(PoseObjective):
+    """A network that finds the middles of hands in whole images (Zhou et al. 2019, Objects as Points).
+
+    Cells within about SPREAD of a middle are to say so, the closer the surer (quality focal loss, Li et al. 2020:
+    the easy ones do not count), and to tell where it is. Every other image is shown in the mirror; some readings are
+    lost.
+    """
+
+    SPREAD = 0.035
+    """Metres."""
+    DROPOUT = 0.2
+    """Share of readings that are lost: up to this."""
+
+    def __init__(self, network: nn.Module, recipe: Recipe, skeleton: Skeleton) -> None:
+        super().__init__(network, recipe, skeleton)
+        self.joints = [0]  # in validation: the middle of the first hand
+
+    def forward(self, batch: Batch) -> Terms:
+        depth, truth = batch['patch'], batch['joints']
+        random = Random(batch['numbers'])
+        mirrored = random.fork(0).chance(0.5)
+        depth = torch.where(mirrored[:, None, None, None], depth.flip(3), depth)
+        truth = truth * torch.stack([torch.where(mirrored, -1.0, 1.0), *truth.new_ones(2, len(truth))], -1)[:, None]
+        share = random.fork(1).uniform(high=self.DROPOUT)[:, None, None, None]
+        depth = depth * (random.fork(2).uniform(*depth.shape[1:]) >= share)
+
+        logits, middles = self.network(depth)
+        hands, z = batch['shown'].float(), (1 + truth[..., 2]).clamp(min=0.1)  # (B, 2)
+        apart = (cell_rays(middles) - truth[..., :2, None, None]).square().sum(2).sqrt()  # (B, 2, h, w) at 1 m
+        spread = (self.SPREAD / z).clamp(min=0.7 * CELL / FOCAL)[..., None, None]
+        near = torch.exp(-0.5 * (apart / spread).square()) * hands[..., None, None]
+        target, whose = near.max(dim=1)
+        number = hands.sum().clamp(min=1)
+        quality = (target - logits.sigmoid()).square()
+        score = F.binary_cross_entropy_with_logits(logits, target, reduction='none') * quality
+
+        mine = truth[torch.arange(len(truth), device=truth.device)[:, None, None], whose].permute(0, 3, 1, 2)
+        off = (middles - mine) * torch.cat([(1 + mine[:, 2:]).expand(-1, 2, -1, -1), torch.ones_like(mine[:, 2:])], 1)
+        place = F.smooth_l1_loss(off, torch.zeros_like(off), reduction='none', beta=0.01).sum(1)
+        return {'score': score.sum() / number, 'place': 2 * (place * target * (target > 0.2)).sum() / number}
+
+    def predict(self, patch: Tensor) -> Tensor:
+        """(B, 1, H, W) metres -> the middle of the likeliest hand (B, 1, 3)."""
+        logits, middles = self.network(patch)
+        best = logits.flatten(1).argmax(1)
+        return middles.flatten(2)[torch.arange(len(patch), device=patch.device), :, best][:, None]
 
 
 class RefinerObjective(nn.Module):

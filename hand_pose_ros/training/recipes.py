@@ -82,6 +82,10 @@ RECIPES = {
     'modern': Recipe(network='hand_dense', augmentation=PRESETS['modern'], loss='smooth_l1', knee=0.01,
                      optimizer='adamw', learning_rate=2e-3, schedule='cosine', warmup=0.02, weight_decay=0.01,
                      batch_size=64, samples=2_000_000, precision='bfloat16', average=0.998),
+    # The same for what finds hands in whole images; its objective has its own augmentation.
+    'finder': Recipe(network='hand_finder', options={}, dataset='scenes', reuse=10, optimizer='adamw',
+                     learning_rate=2e-3, schedule='cosine', warmup=0.02, weight_decay=0.01, batch_size=32,
+                     samples=400_000, precision='bfloat16', average=0.998),
 }
 
 T = TypeVar('T')

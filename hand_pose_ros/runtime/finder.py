@@ -1,0 +1,100 @@
+"""The network that finds hands, run on whole depth images: depth -> cubes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from hand_pose_ros.detection import Region, within
+from hand_pose_ros.errors import InputError
+from hand_pose_ros.geometry import Cube, Intrinsics
+from hand_pose_ros.models.checkpoints import WEIGHTS, load_checkpoint
+from hand_pose_ros.models.finder import FOCAL, MULTIPLE
+from hand_pose_ros.runtime.onnx_engine import open_session, to_onnx
+
+SHIPPED = WEIGHTS / 'detection' / 'hand_finder.safetensors'
+
+MIN_SCORE = 0.1
+"""Places that score less are not worth a look."""
+WIDEST = 768
+"""Pixels of the network's camera, which has 143 degrees with them: no lens without distortion sees more."""
+MOST = 6
+"""Places, the likeliest, that are told of one image."""
+
+
+class Finder:
+    """Depth images to cubes around what looks like a hand; as `detection.candidates`, by a network.
+
+    Always on the CPU: it takes about a millisecond there, and is needed while there is no hand, or to find another.
+
+    Args:
+        network: `models.finder.HandFinder`.
+        num_threads: of the CPU.
+    """
+
+    def __init__(self, network: nn.Module, num_threads: int = 1) -> None:
+        size = {2: 'height', 3: 'width'}
+        model = to_onnx(network, torch.zeros(1, 1, 2 * MULTIPLE, 3 * MULTIPLE), 'depth',
+                        {'depth': size, 'logits': {1: 'rows', 2: 'columns'}, 'middles': {2: 'rows', 3: 'columns'}})
+        self._session = open_session(model, num_threads)
+
+    @classmethod
+    def from_pretrained(cls, path: str | Path = SHIPPED, num_threads: int = 1) -> Finder:
+        """With the weights that ship, or others.
+
+        Raises:
+            CheckpointError: there are no such weights, or they are damaged.
+        """
+        return cls(load_checkpoint(path).network, num_threads)
+
+    def __call__(self, depth: NDArray[np.float32], intrinsics: Intrinsics, *, side: float = 0.30, near: float = 0.1,
+                 far: float = 1.5, regions: Sequence[Region] | None = None) -> list[Cube]:
+        """Cubes around hands, the likeliest first; the arguments are those of `detection.candidates`.
+
+        Raises:
+            InputError: the camera sees more than any camera without distortion can.
+        """
+        rows, columns, height, width = _grid(intrinsics)
+        small = within(depth, regions)[rows[:, None], columns]
+        image = np.zeros((1, 1, height, width), np.float32)
+        image[0, 0, :len(rows), :len(columns)] = np.where((small >= near) & (small <= far), small, 0)
+        logits, middles = self._session.run(None, {'depth': image})
+        logits = logits[0]
+        # A cell that no neighbour surpasses.
+        peaks = (logits >= cv2.dilate(logits, np.ones((3, 3)))) & (logits > math.log(MIN_SCORE / (1 - MIN_SCORE)))
+        ys, xs = np.nonzero(peaks)
+        order = logits[ys, xs].argsort()[::-1][:MOST]
+        x, y, z = middles[0][:, ys[order], xs[order]]
+        z = z + 1
+        # The network's camera looks through the middle of its image.
+        x = x + ((width - 1) / 2 - _scaled(intrinsics.cx, intrinsics.fx)) / FOCAL
+        y = y + ((height - 1) / 2 - _scaled(intrinsics.cy, intrinsics.fy)) / FOCAL
+        return [Cube((float(a * c), float(b * c), float(c)), side) for a, b, c in zip(x, y, z, strict=True)
+                if near <= c <= far]
+
+
+def _scaled(principal: float, focal: float) -> float:
+    """Where a principal point lies in the image of FOCAL pixels; the middle of the first pixel is 0."""
+    return (principal + 0.5) * FOCAL / focal - 0.5
+
+
+@lru_cache(maxsize=8)
+def _grid(intrinsics: Intrinsics) -> tuple[NDArray[np.int64], NDArray[np.int64], int, int]:
+    """Which rows and columns of a camera's image a camera of FOCAL pixels would see, and the size of its image."""
+    def line(length: int, focal: float) -> tuple[NDArray[np.int64], int]:
+        number = max(1, int(length * FOCAL / focal))
+        if number > WIDEST:
+            raise InputError(f'a focal length of {focal:g} pixels in an image of {length} means a view of '
+                             f'{2 * math.degrees(math.atan(length / focal / 2)):.0f} degrees: check the intrinsics')
+        taken = ((np.arange(number) + 0.5) * focal / FOCAL).astype(np.int64).clip(max=length - 1)
+        return taken, -(-number // MULTIPLE) * MULTIPLE
+    (rows, height), (columns, width) = line(intrinsics.height, intrinsics.fy), line(intrinsics.width, intrinsics.fx)
+    return rows, columns, height, width

@@ -48,8 +48,6 @@ SIDE_MEMORY = 0.9
 SETTLED = 5.0
 """A side that has shown itself by more than this (logits) is not doubted until that has faded: about every seventh
 image. The scores of networks that do not judge sides never get there."""
-
-
 USUAL_SIZE = 0.166
 """Metres from the wrist along the bones to the tip of the middle finger, of the hand that a usual cube is for."""
 SIZE_IMAGES = 10
@@ -164,10 +162,13 @@ class HandPoseEstimator:
 
         Raises:
             CheckpointError: there are no such weights, or they are damaged.
+            InputError: there is no such detector.
         """
         checkpoint = load_checkpoint(model)
         engine = make_engine(checkpoint.network, device=device, num_threads=num_threads, refiner=checkpoint.refiner)
         options.setdefault('cube_side', checkpoint.metadata['cube_side'])
+        if detector not in ('network', 'nearest'):
+            raise InputError(f"unknown detector '{detector}': choose network or nearest")
         if detector == 'network':
             options.setdefault('find', Finder.from_pretrained(num_threads=num_threads or default_threads()))
         return cls(engine, get_skeleton(checkpoint.metadata['skeleton']), metadata=checkpoint.metadata, **options)

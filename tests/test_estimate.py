@@ -65,13 +65,13 @@ def bag(tmp_path, depths):
 def command(weights):
     """Run `hand-pose estimate` with weights that are there; every hand counts, and to them everything is a hand."""
     return lambda *args: main(['estimate', *map(str, args), '--model', str(weights), '--min-score', '0',
-                               '--max-hands', '1'])
+                               '--max-hands', '1', '--detector', 'nearest'])
 
 
 @pytest.fixture
 def expected(weights, depths):
     """What the estimator itself says about the sequence."""
-    estimator = HandPoseEstimator.from_pretrained(weights, min_score=0)
+    estimator = HandPoseEstimator.from_pretrained(weights, min_score=0, detector='nearest')
     return [estimator(depth, CAMERA) for depth in depths]
 
 

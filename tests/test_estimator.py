@@ -175,6 +175,11 @@ def test_unknown_weights_are_named():
         HandPoseEstimator.from_pretrained('no_such_model')
 
 
+def test_unknown_detectors_are_named():
+    with pytest.raises(InputError, match='choose network or nearest'):
+        HandPoseEstimator.from_pretrained(DEFAULT, device='cpu', detector='nose')
+
+
 def test_the_hand_is_found_in_real_frames(estimator, shared_data):
     """In nearly all by the default network; the paper's, which is held against the depth, is refused more often."""
     estimator.reset()

@@ -57,7 +57,7 @@ def model(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def settings(model):
-    return Settings(model, 'cpu', num_threads=1, estimator={'min_score': 0.0})
+    return Settings(model, 'cpu', num_threads=1, estimator={'min_score': 0.0, 'detector': 'nearest'})
 
 
 @pytest.fixture(scope='module')
@@ -71,7 +71,8 @@ def result(bag, settings):
 
 
 def arguments(bag, model, *more):
-    return ['evaluate', str(bag), '--model', model, '--device', 'cpu', '--min-score', '0', *map(str, more)]
+    return ['evaluate', str(bag), '--model', model, '--device', 'cpu', '--detector', 'nearest',
+            '--min-score', '0', *map(str, more)]
 
 
 def test_every_image_is_estimated_twice_the_same(bag, settings, result):
@@ -184,8 +185,8 @@ def test_real_bags_without_camera_info_need_intrinsics(shared_data, model, capsy
 def test_many_bags_at_once_and_one_that_fails(tmp_path, bag, model, settings, capsys):
     same_name = record(tmp_path / 'other' / 'ball.mcap', frames=4)
     code = main(['evaluate', str(bag), str(tmp_path / 'none.mcap'), str(same_name), '--model', model, '--device', 'cpu',
-                 '--min-score', '0', '--json', str(tmp_path / 'all.json'), '--out', str(tmp_path / 'out'),
-                 '--out-bag', str(tmp_path / 'hands')])
+                 '--detector', 'nearest', '--min-score', '0', '--json', str(tmp_path / 'all.json'),
+                 '--out', str(tmp_path / 'out'), '--out-bag', str(tmp_path / 'hands')])
     captured = capsys.readouterr()
     assert code == 1 and 'none.mcap: there is no such bag' in captured.err and '1 of 3 bags failed' in captured.err
     got = json.loads((tmp_path / 'all.json').read_text())['bags']

@@ -58,6 +58,8 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('--model', help='name of weights that ship, or a checkpoint (the default weights)')
     parser.add_argument('--device', default='auto', help='auto, cpu, cuda or cuda:N (auto)')
     parser.add_argument('--side', default='auto', choices=('auto', 'left', 'right'), help='which hand it is (auto)')
+    parser.add_argument('--detector', default='network', choices=('network', 'nearest'),
+                        help='how hands are found: by a network, or as what is nearest to the camera (network)')
     parser.add_argument('--cube-size', type=float, metavar='M', help='side of the cube around a hand, metres')
     parser.add_argument('--max-hands', type=int, default=2, metavar='N', help='at most N hands per image (2)')
     parser.add_argument('--min-score', type=float, default=0.4, metavar='S',
@@ -78,8 +80,8 @@ def run(args: argparse.Namespace) -> int:
         from hand_pose_ros.estimator import HandPoseEstimator  # imports torch: not for --help and bad arguments
         options = {} if args.cube_size is None else {'cube_side': args.cube_size}
         estimator = HandPoseEstimator.from_pretrained(
-            args.model, device=args.device, side=args.side, max_hands=args.max_hands, min_score=args.min_score,
-            **options)
+            args.model, device=args.device, detector=args.detector, side=args.side, max_hands=args.max_hands,
+            min_score=args.min_score, **options)
         sinks: list[_Sink] = []
         if args.overlay:
             sinks.append(_Overlays(args.overlay, estimator.skeleton))

@@ -66,6 +66,8 @@ def add_parser(subparsers: Any) -> None:
     bags.add_argument('--model', help='name of weights that ship, or a checkpoint')
     bags.add_argument('--device', default='auto', help='auto (default), cpu, cuda or cuda:N')
     bags.add_argument('--side', choices=('auto', 'left', 'right'), default='auto', help='which hand it is')
+    bags.add_argument('--detector', choices=('network', 'nearest'), default='network',
+                      help='how hands are found: by a network (default), or as what is nearest to the camera')
     bags.add_argument('--cube-size', type=float, metavar='M', help='side of the cube in metres')
     bags.add_argument('--min-score', type=float, metavar='S', help='hands with a lower score are not counted as found')
     bags.add_argument('--depth-topic', metavar='TOPIC', help='needed if several topics carry depth')
@@ -139,8 +141,8 @@ def _evaluate_live(args: argparse.Namespace, settings: Settings) -> Result:
     from hand_pose_ros.ros.live import play_through_node
     from hand_pose_ros.skeleton import get_skeleton
 
-    parameters = {'model': args.model, 'device': args.device, 'side': args.side, 'cube_size': args.cube_size,
-                  'min_score': args.min_score, 'depth_scale': args.depth_scale,
+    parameters = {'model': args.model, 'device': args.device, 'side': args.side, 'detector': args.detector,
+                  'cube_size': args.cube_size, 'min_score': args.min_score, 'depth_scale': args.depth_scale,
                   'max_hands': 1}  # as without the node: one hand is compared, and others would cost time
     if args.intrinsics:
         parameters |= {f'intrinsics.{name}': value for name, value in zip(('fx', 'fy', 'cx', 'cy'), args.intrinsics,
@@ -202,7 +204,7 @@ def _settings(args: argparse.Namespace) -> Settings:
 
     given = {'depth_topic': args.depth_topic, 'camera_info_topic': args.camera_info_topic,
              'intrinsics': args.intrinsics and tuple(args.intrinsics), 'depth_scale': args.depth_scale}
-    estimator = {'side': args.side, 'cube_side': args.cube_size, 'min_score': args.min_score}
+    estimator = {'side': args.side, 'detector': args.detector, 'cube_side': args.cube_size, 'min_score': args.min_score}
     return Settings(args.model, args.device, ground_truth=args.ground_truth,
                     bag={key: value for key, value in given.items() if value is not None},
                     estimator={key: value for key, value in estimator.items() if value is not None})

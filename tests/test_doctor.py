@@ -11,6 +11,7 @@ from hand_pose_ros.cli import doctor, main
 from hand_pose_ros.models import build, checkpoints
 from hand_pose_ros.models.checkpoints import save_checkpoint
 from hand_pose_ros.resources import resource
+from hand_pose_ros.runtime import finder
 
 PROFILE = resource('config/fastdds_large_images.xml')
 
@@ -46,13 +47,19 @@ def test_a_good_installation(weights: Path, monkeypatch: pytest.MonkeyPatch,
     assert code == 0
     assert about['package'][0].startswith(f'ok: hand_pose_ros {__version__}')
     assert 'torch' in about['libraries'][0] and 'rosbags' in about['libraries'][0]
-    assert about['weights'] == ['ok: hand_dense (default): deep_prior, hand21, cube of 0.3 m']
+    assert about['weights'] == ['ok: hand_dense (default): deep_prior, hand21, cube of 0.3 m',
+                                'ok: hand_finder: finds hands in whole images']
     assert 'onnxruntime on the CPU' in about['device'][0] or 'cuda' in about['device'][0]
     assert 'rmw_' in about['ROS 2'][0] and 'messages built' in about['ROS 2'][0]
     assert '16384 kB' in about['DDS profile'][0]
 
 
-def test_missing_and_damaged_weights(weights: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_missing_and_damaged_weights(weights: Path, monkeypatch: pytest.MonkeyPatch,
+                                     capsys: pytest.CaptureFixture[str]) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(finder, 'SHIPPED', weights.with_name('none.safetensors'))
+        code, about = report(capsys)
+        assert code == 1 and 'none.safetensors' in about['weights'][1] and 'to nearest' in about['weights'][1]
     weights.write_bytes(weights.read_bytes()[:1000])
     code, about = report(capsys)
     assert code == 1 and about['weights'][0].startswith('WRONG: ') and 'damaged' in about['weights'][0]

@@ -103,6 +103,7 @@ def _device() -> Findings:
 
 def _weights() -> Findings:
     from hand_pose_ros.models.checkpoints import DEFAULT, available, load_checkpoint
+    from hand_pose_ros.runtime.finder import SHIPPED
 
     for name in available():
         about = load_checkpoint(name).metadata
@@ -110,6 +111,11 @@ def _weights() -> Findings:
                      f'cube of {about["cube_side"]:g} m')
     if DEFAULT not in available():
         yield 'WRONG', f'the default weights {DEFAULT} are missing: reinstall the package, or name others with --model'
+    try:
+        load_checkpoint(SHIPPED)
+        yield 'ok', f'{SHIPPED.stem}: finds hands in whole images'
+    except HandPoseError as error:
+        yield 'WRONG', f'{error}; or set the parameter detector to nearest'
 
 
 def _ros() -> Findings:

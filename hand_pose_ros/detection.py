@@ -83,7 +83,12 @@ def candidates(depth: NDArray[np.float32], intrinsics: Intrinsics, *, side: floa
         near, far: range in which hands are looked for, metres.
         regions: what lies outside these rectangles does not count; None = the whole image.
     """
-    scene = _Scene(within(depth, regions), intrinsics, near, far)
+    if regions is not None:
+        inside = np.zeros(depth.shape, bool)
+        for x, y, width, height in regions:
+            inside[max(y, 0):max(y + height, 0), max(x, 0):max(x + width, 0)] = True
+        depth = np.where(inside, depth, np.float32(0))
+    scene = _Scene(depth, intrinsics, near, far)
     found: list[Cube] = []
     z, unseen = scene.z, scene.z > 0
     present = z[unseen]
@@ -108,16 +113,6 @@ def candidates(depth: NDArray[np.float32], intrinsics: Intrinsics, *, side: floa
             _, inside, rows, cols = scene.inside(center, side)
             unseen[rows, cols] &= ~inside
             unseen[piece] = False
-
-
-def within(depth: NDArray[np.float32], regions: Sequence[Region] | None) -> NDArray[np.float32]:
-    """A depth image without the readings outside of all regions; None = as it is."""
-    if regions is None:
-        return depth
-    inside = np.zeros(depth.shape, bool)
-    for x, y, width, height in regions:
-        inside[max(y, 0):max(y + height, 0), max(x, 0):max(x + width, 0)] = True
-    return np.where(inside, depth, np.float32(0))
 
 
 def detect(depth: NDArray[np.float32], intrinsics: Intrinsics, *, max_hands: int = 1, **where: Any) -> list[Cube]:

@@ -115,7 +115,8 @@ class HandPoseEstimator:
         skeleton: the joints that the network gives.
         find: where hands may be, the best place first: `detection.candidates` (the nearest things, as in the paper) or
             a `runtime.finder.Finder`.
-        cube_side: length of the cube's side in metres; the network was trained for about this size.
+        cube_side: length of the cube's side in metres; the network was trained for about this size. While a hand is
+            tracked, the usual one is scaled by the size that the network tells of the hand.
         side: 'auto' finds out which hand it is; 'left' or 'right' states it.
         max_hands: at most this many hands per image (the node and the command line take 2; evaluation, benchmarks and
             labels are about one).
@@ -185,7 +186,7 @@ class HandPoseEstimator:
 
     def __call__(self, depth: NDArray[np.float32], intrinsics: Intrinsics, *, time_s: float | None = None,
                  regions: Sequence[Region] | None = None) -> list[HandEstimate]:
-        """The hands in a depth image: tracked ones first, then those newly found, nearest first.
+        """The hands in a depth image: tracked ones first, then those newly found, the likeliest first.
 
         Args:
             depth: (H, W) float32 metres, 0 = no reading.
@@ -208,7 +209,8 @@ class HandPoseEstimator:
 
         hands: list[HandEstimate] = []
         for track in list(self._tracks):
-            cube = Cube(track.center, self.cube_side * track.scale)
+            usual = self.cube_side == self.metadata.get('cube_side')  # another was chosen with a hand in mind
+            cube = Cube(track.center, self.cube_side * (track.scale if usual else 1))
             with self._timed('detect'):
                 alive = holds_a_hand(depth, intrinsics, cube, near=self.near, far=self.far,
                                      max_through=1 if 'hand' in self.engine.outputs else MAX_THROUGH)

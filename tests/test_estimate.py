@@ -133,7 +133,7 @@ def test_markers_are_in_the_bag_without_ros(tmp_path, depths, weights, monkeypat
 
 
 def test_images_without_a_hand_are_answered_too(tmp_path, bag, weights):
-    args = ['estimate', str(bag), '--model', str(weights), '--min-score', '1.1']
+    args = ['estimate', str(bag), '--model', str(weights), '--min-score', '1']
     assert main([*args, '--out', str(tmp_path / 'a.mcap')]) == main([*args, '--out', str(tmp_path / 'a.npz')]) == 0
     assert [len(record.joints) for record in read_hands(tmp_path / 'a.mcap')] == [0] * 6
     result = np.load(tmp_path / 'a.npz')
@@ -169,11 +169,20 @@ def test_nothing_usable_writes_nothing(tmp_path, command, capsys):
 
 
 @pytest.mark.parametrize('args', [
-    ('--out', 'joints.npz'), INTRINSICS, (*INTRINSICS, '--out', 'joints.csv'), ('--intrinsics', '1', '2', '3')])
+    ('--out', 'joints.npz'), INTRINSICS, (*INTRINSICS, '--out', 'joints.csv'), ('--intrinsics', '1', '2', '3'),
+    *((*INTRINSICS, '--out', 'joints.npz', name, value) for name, value in (
+        ('--max-hands', '0'), ('--min-score', '7'), ('--min-score', '-1'), ('--cube-size', '300'),
+        ('--cube-size', '-0.3'), ('--depth-scale', '-0.001'), ('--depth-scale', '1000'), ('--detector', 'nose')))])
 def test_bad_arguments_exit_with_2(folder, command, args):
     with pytest.raises(SystemExit) as leaving:
         command(folder, *args)
     assert leaving.value.code == 2
+
+
+def test_where_nothing_can_be_written_is_said(tmp_path, folder, command, capsys):
+    (tmp_path / 'file').write_text('')
+    assert command(folder, *INTRINSICS, '--overlay', tmp_path / 'file') == 1
+    assert f'{tmp_path / "file"}: File exists' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize('name', ['missing.mcap', 'missing.png', '.'])
@@ -183,7 +192,7 @@ def test_a_missing_input_exits_with_1_and_names_it(tmp_path, command, capsys, na
 
 
 def test_the_wrong_unit_of_depth_is_named(tmp_path, folder, command, capsys):
-    out = ('--out', tmp_path / 'joints.npz', '--min-score', '1.1')
+    out = ('--out', tmp_path / 'joints.npz', '--min-score', '1')
     assert command(folder, *INTRINSICS, *out, '--depth-scale', '0.1') == 0
     said = capsys.readouterr().err
     assert '100% of the depth is outside 0.1 to 1.5 m' in said and 'check depth_scale' in said

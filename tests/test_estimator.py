@@ -79,6 +79,17 @@ def test_a_hand_before_a_wall_or_over_a_table_is_found_and_followed(sequence, ti
     assert np.median(errors) < 0.025
 
 
+def test_the_cube_of_a_tracked_hand_fits_it_unless_its_size_was_given(sequence):
+    def sides(**options):
+        estimator = HandPoseEstimator.from_pretrained(DEFAULT, device='cpu', **options)
+        return [hand.cube.side for frame in sequence for hand in estimator(frame.depth, frame.intrinsics)]
+
+    assert set(sides(cube_side=0.27)) == {0.27}
+    usual = sides()
+    assert usual[0] == 0.3 and len(set(usual)) > 10
+    assert max(abs(np.diff(usual))) < 0.01 and 0.24 < min(usual) < max(usual) < 0.37
+
+
 @pytest.fixture(scope='module')
 def sequence_of_two(sequence):
     """The hand, and beside it the same once more."""

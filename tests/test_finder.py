@@ -6,10 +6,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hand_pose_ros.errors import InputError
+from hand_pose_ros.errors import CheckpointError, HandPoseError, InputError
+from hand_pose_ros.estimator import HandPoseEstimator
 from hand_pose_ros.geometry import Intrinsics
+from hand_pose_ros.models.checkpoints import WEIGHTS
 from hand_pose_ros.models.finder import CELL, FOCAL, MULTIPLE, cell_rays
-from hand_pose_ros.runtime.finder import Finder
+from hand_pose_ros.runtime.finder import SHIPPED, Finder
 from hand_pose_ros.synthetic.generator import SyntheticHands
 
 CAMERA = Intrinsics(570.0, 570.0, 320.0, 240.0, 640, 480)
@@ -79,6 +81,13 @@ def test_range_and_regions_limit_where_hands_are_looked_for(nearest) -> None:
     assert {round(cube.center[2], 3) for cube in nearest(depth, CAMERA, far=0.6)} == {0.5}
     assert {round(cube.center[2], 3) for cube in nearest(depth, CAMERA, regions=[(480, 280, 100, 100)])} == {0.8}
     assert nearest(depth, CAMERA, regions=[]) == []
+
+
+def test_weights_of_another_network_are_refused() -> None:
+    with pytest.raises(CheckpointError, match='not a hand_finder'):
+        Finder.from_pretrained(WEIGHTS / 'deep_prior.safetensors')
+    with pytest.raises(HandPoseError, match='give no joints'):
+        HandPoseEstimator.from_pretrained(SHIPPED, device='cpu')
 
 
 def test_a_camera_that_cannot_be_is_refused_with_the_reason(find) -> None:

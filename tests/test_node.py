@@ -375,6 +375,18 @@ def test_parameters_change_between_images_or_are_refused_with_the_reason(rig: Ri
     assert rig.answer(publish, image(depth_with_hand())).hands
 
 
+def test_a_parameter_that_there_is_not_is_named(rig: Rig) -> None:
+    rig.start(max_depht=1.0)
+    rig.until_said("no parameter 'max_depht'", 'no effect')
+
+
+@pytest.mark.parametrize('arguments', [('--params-file', '/nowhere.yaml'), ('-r', 'depth/image_rect')])
+def test_arguments_that_ros_cannot_read_are_one_sentence(arguments: tuple[str, ...]) -> None:
+    done = subprocess.run([*COMMAND, 'estimator', '--ros-args', *arguments], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert 'the arguments of ROS cannot be used' in done.stderr and 'Traceback' not in done.stderr
+
+
 def test_smoothing_holds_a_hand_still_that_jumps(rig: Rig) -> None:
     rig.start(smoothing=0.5)
     publish = rig.camera(info=camera_info())

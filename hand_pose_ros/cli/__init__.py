@@ -51,6 +51,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except HandPoseError as error:
         print(f'hand-pose {args.verb}: {error}', file=sys.stderr)
         return 1
+    except OSError as error:  # a file that cannot be read or written
+        print(f'hand-pose {args.verb}: ' + (f'{error.filename}: {error.strerror}' if error.filename else str(error)),
+              file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         print(f'hand-pose {args.verb}: interrupted', file=sys.stderr)
         return 1

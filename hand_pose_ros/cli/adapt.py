@@ -9,6 +9,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hand_pose_ros.cli.arguments import count, metres
 from hand_pose_ros.errors import HandPoseError
 
 if TYPE_CHECKING:
@@ -47,12 +48,12 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('--model', help='weights to start from: a name or a checkpoint (the default weights)')
     parser.add_argument('--side', default='auto', choices=('auto', 'left', 'right'),
                         help='which hand it is (auto); say it if you can')
-    parser.add_argument('--steps', type=int, default=300, metavar='N', help='of training, 32 samples each (300)')
+    parser.add_argument('--steps', type=count, default=300, metavar='N', help='of training, 32 samples each (300)')
     parser.add_argument('--ground-truth', metavar='G', help='only for the comparison: a topic of the bag with '
                         'HandJointsArray, or an .npz file as for `hand-pose evaluate`')
     parser.add_argument('--intrinsics', nargs=4, type=float, metavar=('FX', 'FY', 'CX', 'CY'),
                         help='of the camera in pixels; needed for bags without camera_info')
-    parser.add_argument('--depth-scale', type=float, metavar='M', help='metres per depth unit (0.001)')
+    parser.add_argument('--depth-scale', type=metres, metavar='M', help='metres per depth unit (0.001)')
     parser.add_argument('--depth-topic', metavar='TOPIC', help='needed if several topics carry depth')
     parser.add_argument('--camera-info-topic', metavar='TOPIC', help='if not camera_info beside the depth topic')
     parser.set_defaults(parser=parser)

@@ -11,6 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hand_pose_ros.cli.arguments import count
+
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
@@ -41,8 +43,8 @@ def add_parser(subparsers: Any) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--json', type=Path, metavar='FILE', help='write the rows there too')
     parser.add_argument('--model', help='whole frames with these weights, by name or path (random ones)')
-    parser.add_argument('--threads', type=int, metavar='N', help='threads for the networks (chosen by the cores)')
-    parser.add_argument('--rounds', type=int, default=20, metavar='N',
+    parser.add_argument('--threads', type=count, metavar='N', help='threads for the networks (chosen by the cores)')
+    parser.add_argument('--rounds', type=count, default=20, metavar='N',
                         help=f'rounds of {_CALLS} calls for each row (%(default)s)')
     parser.add_argument('--quick', action='store_true',
                         help='one round, and without torch.compile, which takes a minute')

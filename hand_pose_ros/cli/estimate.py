@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from hand_pose_ros.bags import DepthBag
+from hand_pose_ros.cli.arguments import count, metres, share
 from hand_pose_ros.cli.hand_bag import HandBag
 from hand_pose_ros.depth import depth_problem, read_png
 from hand_pose_ros.drawing import overlay
@@ -52,7 +53,7 @@ def add_parser(subparsers: Any) -> None:
                         'or a folder of them')
     parser.add_argument('--intrinsics', nargs=4, type=float, metavar=('FX', 'FY', 'CX', 'CY'),
                         help='of the camera in pixels; needed for PNGs and for bags without camera_info')
-    parser.add_argument('--depth-scale', type=float, default=0.001, metavar='M', help='metres per depth unit (0.001)')
+    parser.add_argument('--depth-scale', type=metres, default=0.001, metavar='M', help='metres per depth unit (0.001)')
     parser.add_argument('--depth-topic', metavar='TOPIC', help='which of several depth topics of a bag')
     parser.add_argument('--camera-info-topic', metavar='TOPIC', help='if not camera_info beside the depth topic')
     parser.add_argument('--model', help='name of weights that ship, or a checkpoint (the default weights)')
@@ -60,9 +61,9 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('--side', default='auto', choices=('auto', 'left', 'right'), help='which hand it is (auto)')
     parser.add_argument('--detector', default='network', choices=('network', 'nearest'),
                         help='how hands are found: by a network, or as what is nearest to the camera (network)')
-    parser.add_argument('--cube-size', type=float, metavar='M', help='side of the cube around a hand, metres')
-    parser.add_argument('--max-hands', type=int, default=2, metavar='N', help='at most N hands per image (2)')
-    parser.add_argument('--min-score', type=float, default=0.4, metavar='S',
+    parser.add_argument('--cube-size', type=metres, metavar='M', help='side of the cube around a hand, metres')
+    parser.add_argument('--max-hands', type=count, default=2, metavar='N', help='at most N hands per image (2)')
+    parser.add_argument('--min-score', type=share, default=0.4, metavar='S',
                         help='leave out hands below this score (0.4)')
     parser.add_argument('--out', type=Path, metavar='FILE', help='.npz or .mcap')
     parser.add_argument('--overlay', type=Path, metavar='FOLDER', help='a picture of every image with its joints')

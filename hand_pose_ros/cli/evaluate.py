@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
+from hand_pose_ros.cli.arguments import count, metres, share
 from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.evaluation import published
 from hand_pose_ros.evaluation.results import Result, write_json
@@ -68,16 +69,16 @@ def add_parser(subparsers: Any) -> None:
     bags.add_argument('--side', choices=('auto', 'left', 'right'), default='auto', help='which hand it is')
     bags.add_argument('--detector', choices=('network', 'nearest'), default='network',
                       help='how hands are found: by a network (default), or as what is nearest to the camera')
-    bags.add_argument('--cube-size', type=float, metavar='M', help='side of the cube in metres')
-    bags.add_argument('--min-score', type=float, metavar='S', help='hands with a lower score are not counted as found')
+    bags.add_argument('--cube-size', type=metres, metavar='M', help='side of the cube in metres')
+    bags.add_argument('--min-score', type=share, metavar='S', help='hands with a lower score are not counted as found')
     bags.add_argument('--depth-topic', metavar='TOPIC', help='needed if several topics carry depth')
     bags.add_argument('--camera-info-topic', metavar='TOPIC', help='if it is not beside the depth topic')
-    bags.add_argument('--depth-scale', type=float, metavar='M', help='metres per unit of 16-bit depth (0.001)')
+    bags.add_argument('--depth-scale', type=metres, metavar='M', help='metres per unit of 16-bit depth (0.001)')
     bags.add_argument('--out-bag', metavar='BAG', help='write /hand/joints and /hand/markers there, to be played '
                       'beside the original; with several bags a folder')
     bags.add_argument('--via-ros', action='store_true', help='play the bag through the live node at its pace, and '
                       'report the images it dropped and the latency from image to joints')
-    bags.add_argument('--jobs', type=int, metavar='N', help='bags at the same time (default: one per core)')
+    bags.add_argument('--jobs', type=count, metavar='N', help='bags at the same time (default: one per core)')
 
 
 def run(args: argparse.Namespace) -> int:

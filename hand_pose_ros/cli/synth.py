@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hand_pose_ros.cli.arguments import count
 from hand_pose_ros.errors import HandPoseError
 
 if TYPE_CHECKING:
@@ -51,31 +52,24 @@ def add_parser(subparsers: Any) -> None:
 
     show = actions.add_parser('show', parents=[common, real], help='a contact sheet')
     show.add_argument('out', type=Path, metavar='FILE', help='a PNG')
-    show.add_argument('--number', type=_positive, default=48, metavar='N', help='samples, or columns per sensor (48)')
+    show.add_argument('--number', type=count, default=48, metavar='N', help='samples, or columns per sensor (48)')
     show.add_argument('--joints', action='store_true', help='draw the joints; hidden ones hollow')
     show.add_argument('--clean', action='store_true', help='as a perfect sensor would see them')
     show.add_argument('--per-sensor', action='store_true', help='the same hands seen by each sensor, one a row')
 
     write = actions.add_parser('write', parents=[common], help='a dataset in .npz shards')
     write.add_argument('out', type=Path, metavar='FOLDER')
-    write.add_argument('--number', type=_positive, required=True, metavar='N', help='samples')
-    write.add_argument('--shard', type=_positive, default=4096, metavar='N', help='samples per file (4096)')
+    write.add_argument('--number', type=count, required=True, metavar='N', help='samples')
+    write.add_argument('--shard', type=count, default=4096, metavar='N', help='samples per file (4096)')
     write.add_argument('--device', default='cpu', help='cpu, cuda or cuda:N (cpu)')
 
     record = actions.add_parser('record', parents=[common], help='a bag of one moving hand, with its true joints')
     record.add_argument('out', type=Path, metavar='BAG', help='a .mcap or .db3 file, or the folder of a ROS 2 bag')
-    record.add_argument('--number', type=_positive, default=90, metavar='N', help='images, 30 a second (90)')
+    record.add_argument('--number', type=count, default=90, metavar='N', help='images, 30 a second (90)')
 
     stats = actions.add_parser('stats', parents=[common, real], help='numbers of synthetic beside real crops')
-    stats.add_argument('--number', type=_positive, default=512, metavar='N', help='synthetic samples (512)')
+    stats.add_argument('--number', type=count, default=512, metavar='N', help='synthetic samples (512)')
     parser.set_defaults(parser=parser)
-
-
-def _positive(text: str) -> int:
-    value = int(text)
-    if value <= 0:
-        raise argparse.ArgumentTypeError(f'{value} is not a positive number')
-    return value
 
 
 def run(args: argparse.Namespace) -> int:

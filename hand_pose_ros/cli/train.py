@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from hand_pose_ros.cli.arguments import count
+
 EPILOG = """examples:
   hand-pose train modern --out runs/modern
   hand-pose train paper --out runs/deep-prior --set samples=1_000_000 --set augmentation=modern
@@ -40,7 +42,7 @@ def add_machine_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--device', default='cpu', help='cpu or cuda (default: %(default)s)')
     parser.add_argument('--workers', type=int, default=1,
                         help='processes that render or decode; 0: on the device, for a GPU (default: %(default)s)')
-    parser.add_argument('--threads', type=int, help='threads of the training process (default: all cores)')
+    parser.add_argument('--threads', type=count, help='threads of the training process (default: all cores)')
     parser.add_argument('--cache', type=Path, default=Path('~/.cache/hand_pose_ros/samples').expanduser(),
                         help='where rendered and decoded samples are kept for all runs (default: %(default)s)')
     parser.add_argument('--cache-gb', type=float, default=40,
@@ -73,9 +75,9 @@ def run(args: argparse.Namespace) -> int:
     from hand_pose_ros.training.recipes import get_recipe
 
     if args.resume and (args.recipe or args.overrides):
-        args.parser.error('--resume continues with the recipe of the run: give neither RECIPE nor --set')
+        args.parser.error('--resume continues with the recipe of the run: give --out and no RECIPE or --set')
     if not args.resume and not args.recipe:
-        args.parser.error('give a RECIPE (paper, original-code or modern), or --resume')
+        args.parser.error('give a RECIPE (paper, original-code, modern or finder), or --resume')
     show_progress()
     recipe = RunFolder(args.out).recipe() if args.resume else get_recipe(args.recipe, args.overrides)
     with logging_redirect_tqdm(), process_group(args.device):

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hand_pose_ros.bags import DepthBag
+from hand_pose_ros.cli.arguments import count, metres, share
 from hand_pose_ros.depth import to_units
 from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.geometry import Intrinsics
@@ -40,15 +41,15 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('bag', metavar='BAG', type=Path, nargs='?', help='a .bag, .mcap or .db3 file, or a ROS 2 '
                         'folder: its hands are estimated; without it, live topics are shown')
     parser.add_argument('--save', metavar='FILE', type=Path, help='write an .rrd file instead of opening the viewer')
-    parser.add_argument('--depth-scale', type=float, default=0.001, metavar='M', help='metres per depth unit (0.001)')
+    parser.add_argument('--depth-scale', type=metres, default=0.001, metavar='M', help='metres per depth unit (0.001)')
     bag = parser.add_argument_group('with a bag')
     bag.add_argument('--depth-topic', metavar='TOPIC', help='which of several depth topics')
     bag.add_argument('--intrinsics', nargs=4, type=float, metavar=('FX', 'FY', 'CX', 'CY'),
                      help='of the camera in pixels; for bags without camera_info')
     bag.add_argument('--model', help='name of weights that ship, or a checkpoint (the default weights)')
     bag.add_argument('--side', default='auto', choices=('auto', 'left', 'right'), help='which hand it is (auto)')
-    bag.add_argument('--max-hands', type=int, default=2, metavar='N', help='at most N hands per image (2)')
-    bag.add_argument('--min-score', type=float, default=0.4, metavar='S', help='leave out hands below it (0.4)')
+    bag.add_argument('--max-hands', type=count, default=2, metavar='N', help='at most N hands per image (2)')
+    bag.add_argument('--min-score', type=share, default=0.4, metavar='S', help='leave out hands below it (0.4)')
     live = parser.add_argument_group('live')
     live.add_argument('--transport', default='raw', choices=('raw', 'compressedDepth', 'compressed'),
                       help='of the depth images (raw)')

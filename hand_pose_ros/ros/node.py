@@ -32,6 +32,7 @@ from hand_pose_ros.detection import Region
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.estimator import HandEstimate, HandPoseEstimator
 from hand_pose_ros.geometry import Intrinsics
+from hand_pose_ros.models.checkpoints import DEFAULT
 from hand_pose_ros.ros import params as parameters
 from hand_pose_ros.ros import qos, topics
 from hand_pose_ros.ros.camera import Camera
@@ -73,6 +74,9 @@ class EstimatorNode(LifecycleNode):
         self._reset = False  # asked for; the worker, who alone touches the estimator, does it
         super().__init__('estimator', **kwargs)
         self._params = parameters.declare(self)
+        for name in parameters.unknown(self):
+            self.get_logger().warning(f"there is no parameter '{name}', so it has no effect: "
+                                      'hand-pose estimator --parameters lists those that there are')
         self.add_on_set_parameters_callback(self._on_parameters)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', qos.RESULTS)
         self.create_service(SetBool, '~/enable', self._on_enable)
@@ -218,7 +222,7 @@ class EstimatorNode(LifecycleNode):
             self._diagnostics.publish(DiagnosticArray(header=now, status=[status]))
 
     def _facts(self) -> dict[str, str]:
-        facts = {'model': self._params.model or 'default'}
+        facts = {'model': self._params.model or DEFAULT, 'detector': self._params.detector}
         if self._estimator is not None:
             facts['engine'] = self._estimator.engine.name
         if self._worker is not None:
@@ -285,9 +289,12 @@ def main(args: list[str] | None = None) -> int:
     """Run the node until Ctrl-C (or SIGTERM), which is no error.
 
     Raises:
-        HandPoseError: a parameter at start has a wrong type or value.
+        HandPoseError: a parameter at start has a wrong type or value, or the arguments of ROS are no such.
     """
-    rclpy.init(args=args)
+    try:
+        rclpy.init(args=args)
+    except RuntimeError as error:  # RCLError, which rclpy keeps to itself
+        raise HandPoseError(f'the arguments of ROS cannot be used: {str(error).splitlines()[0]}') from error
     executor, node = SingleThreadedExecutor(), None
     try:
         node = EstimatorNode()

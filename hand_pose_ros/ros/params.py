@@ -52,7 +52,9 @@ class Params:
     intrinsics_cx: float = _parameter(0.0, 'Principal point in pixels.', name='intrinsics.cx', low=-1e5, high=1e5)
     intrinsics_cy: float = _parameter(0.0, 'Principal point in pixels.', name='intrinsics.cy', low=-1e5, high=1e5)
     min_depth: float = _parameter(0.1, 'Hands are looked for beyond this distance.', low=0.01, high=10.0)
-    max_depth: float = _parameter(1.5, 'Hands are looked for up to this distance.', low=0.05, high=10.0)
+    max_depth: float = _parameter(1.5, 'Hands are looked for up to this distance. The network that finds them '
+                              'knows none beyond about 1.5 m: further away, set detector to nearest.',
+                              low=0.05, high=10.0)
     cube_size: float = _parameter(0.0, 'Side of the cube around a hand; 0 = what the model was trained for.',
                                   low=0.0, high=1.0)
     side: str = _parameter('auto', 'Which hands there are; auto finds out.', choices=('auto', 'left', 'right'))
@@ -141,6 +143,14 @@ def declare(node: Node) -> Params:
     values = {row.name: node.declare_parameter(ros_name(row), row.default, _descriptor(row)).value
               for row in fields(Params)}
     return Params(**values)
+
+
+def unknown(node: Node) -> list[str]:
+    """Names of parameters that were given at start and are none of ours, nor any that rclpy declares later."""
+    ours = {ros_name(row) for row in fields(Params)}
+    given = getattr(node, '_parameter_overrides', {})  # rclpy tells nobody
+    return [name for name in given if name not in ours and name != 'use_sim_time' and not name.startswith('qos_')
+            and not name.startswith('start_type_description_service')]
 
 
 def changed(params: Params, changes: Sequence[Parameter], *, configured: bool) -> Params:

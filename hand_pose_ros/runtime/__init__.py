@@ -16,6 +16,9 @@ from hand_pose_ros.runtime.onnx_engine import OnnxEngine
 
 __all__ = ['Engine', 'default_threads', 'make_engine']
 
+NO_JOINTS = ('hand_finder', 'center_refiner', 'std_ref', 'or_ref')
+"""Networks that are parts of something, or find hands."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -37,8 +40,11 @@ def make_engine(network: nn.Module, device: str = 'auto', num_threads: int | Non
         num_threads: on the CPU; None takes `default_threads()`.
 
     Raises:
-        HandPoseError: the device does not exist here, or `num_threads` is below 1.
+        HandPoseError: the device does not exist here, `num_threads` is below 1, or the network gives no joints.
     """
+    if (architecture := getattr(network, 'architecture', '')) in NO_JOINTS:
+        raise HandPoseError(f'weights of {architecture} give no joints: choose those of a network that does '
+                            '(docs/models.md)')
     if num_threads is not None and num_threads < 1:
         raise HandPoseError(f'num_threads is {num_threads}, but a network needs at least one')
     why = f"device '{device}' was asked for"

@@ -13,8 +13,8 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from hand_pose_ros.detection import Region, within
-from hand_pose_ros.errors import InputError
+from hand_pose_ros.detection import Region
+from hand_pose_ros.errors import CheckpointError, InputError
 from hand_pose_ros.geometry import Cube, Intrinsics
 from hand_pose_ros.models.checkpoints import WEIGHTS, load_checkpoint
 from hand_pose_ros.models.finder import FOCAL, MULTIPLE
@@ -33,7 +33,7 @@ MOST = 6
 class Finder:
     """Depth images to cubes around what looks like a hand; as `detection.candidates`, by a network.
 
-    Always on the CPU: it takes about a millisecond there, and is needed while there is no hand, or to find another.
+    Always on the CPU: it takes one or two milliseconds there, and is needed while there is no hand, or to find another.
 
     Args:
         network: `models.finder.HandFinder`.
@@ -51,19 +51,24 @@ class Finder:
         """With the weights that ship, or others.
 
         Raises:
-            CheckpointError: there are no such weights, or they are damaged.
+            CheckpointError: there are no such weights, they are damaged, or they are of another network.
         """
-        return cls(load_checkpoint(path).network, num_threads)
+        checkpoint = load_checkpoint(path)
+        if checkpoint.metadata['architecture'] != 'hand_finder':
+            raise CheckpointError(f"{path} holds a {checkpoint.metadata['architecture']}, not a hand_finder")
+        return cls(checkpoint.network, num_threads)
 
     def __call__(self, depth: NDArray[np.float32], intrinsics: Intrinsics, *, side: float = 0.30, near: float = 0.1,
                  far: float = 1.5, regions: Sequence[Region] | None = None) -> list[Cube]:
         """Cubes around hands, the likeliest first; the arguments are those of `detection.candidates`.
 
+        The whole image is looked at, whatever the regions are: where an arm is cut off, it ends like a hand.
+
         Raises:
             InputError: the camera sees more than any camera without distortion can.
         """
         rows, columns, height, width = _grid(intrinsics)
-        small = within(depth, regions)[rows[:, None], columns]
+        small = depth[rows[:, None], columns]
         image = np.zeros((1, 1, height, width), np.float32)
         image[0, 0, :len(rows), :len(columns)] = np.where((small >= near) & (small <= far), small, 0)
         logits, middles = self._session.run(None, {'depth': image})
@@ -71,14 +76,18 @@ class Finder:
         # A cell that no neighbour surpasses.
         peaks = (logits >= cv2.dilate(logits, np.ones((3, 3)))) & (logits > math.log(MIN_SCORE / (1 - MIN_SCORE)))
         ys, xs = np.nonzero(peaks)
-        order = logits[ys, xs].argsort()[::-1][:MOST]
-        x, y, z = middles[0][:, ys[order], xs[order]]
+        x, y, z = middles[0][:, ys, xs]
         z = z + 1
         # The network's camera looks through the middle of its image.
         x = x + ((width - 1) / 2 - _scaled(intrinsics.cx, intrinsics.fx)) / FOCAL
         y = y + ((height - 1) / 2 - _scaled(intrinsics.cy, intrinsics.fy)) / FOCAL
-        return [Cube((float(a * c), float(b * c), float(c)), side) for a, b, c in zip(x, y, z, strict=True)
-                if near <= c <= far]
+        u, v = x * intrinsics.fx + intrinsics.cx, y * intrinsics.fy + intrinsics.cy
+        wanted = (z >= near) & (z <= far)
+        if regions is not None:
+            wanted &= np.any([(u >= left) & (u < left + across) & (v >= top) & (v < top + down)
+                              for left, top, across, down in regions] or [np.zeros(len(z), bool)], axis=0)
+        order = [k for k in logits[ys, xs].argsort()[::-1] if wanted[k]][:MOST]
+        return [Cube((float(x[k] * z[k]), float(y[k] * z[k]), float(z[k])), side) for k in order]
 
 
 def _scaled(principal: float, focal: float) -> float:

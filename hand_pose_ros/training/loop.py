@@ -26,7 +26,7 @@ from hand_pose_ros.datasets.shards import DiskShards, MemoryShards
 from hand_pose_ros.models import build
 from hand_pose_ros.models.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from hand_pose_ros.models.prior import fit_prior
-from hand_pose_ros.training.augmentation import augment
+from hand_pose_ros.training.augmentation import PRESETS, augment
 from hand_pose_ros.training.folder import RunFolder, TrainingError
 from hand_pose_ros.training.objectives import (
     CenterObjective,
@@ -142,6 +142,8 @@ class Run:
         if (recipe.network == 'hand_finder') != (recipe.dataset == 'scenes'):
             raise TrainingError(f'{recipe.network} cannot learn from {recipe.dataset}: hand_finder, and nothing else, '
                                 'is trained with dataset=scenes')
+        if recipe.network == 'hand_finder' and recipe.augmentation != PRESETS['none']:
+            raise TrainingError('hand_finder has its own augmentation: leave out --set augmentation')
         network = build(recipe.network, **({'joints': joints} if of_joints else {}), **recipe.options)
         bottleneck = recipe.options.get('bottleneck')
         has_prior = base is not None and self._start_from(network, base)

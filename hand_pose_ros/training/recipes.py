@@ -1,4 +1,4 @@
-"""What is trained on what, and how: one dataclass, three named recipes, any value replaceable on the command line."""
+"""What is trained on what, and how: one dataclass, four named recipes, any value replaceable on the command line."""
 
 from __future__ import annotations
 

@@ -53,6 +53,7 @@ def main() -> None:
     parser.add_argument('--min-score', type=float, help='(that of the estimator)')
     parser.add_argument('--looks', type=int, default=hand_pose_ros.estimator.LOOKS,
                         help='how often a cube is read, where its joints are not in its middle (%(default)s)')
+    parser.add_argument('--detector', default='network', choices=('network', 'nearest'))
     parser.add_argument('--sides-known', action='store_true', help='tell the estimator whether it is a left hand')
     args = parser.parse_args()
     hand_pose_ros.estimator.LOOKS = args.looks
@@ -60,7 +61,7 @@ def main() -> None:
     table: dict[str, dict[str, Any]] = {}
     for model in args.model:
         options = {} if args.min_score is None else {'min_score': args.min_score}
-        estimator = HandPoseEstimator.from_pretrained(model, device='cpu', **options)
+        estimator = HandPoseEstimator.from_pretrained(model, device='cpu', detector=args.detector, **options)
         estimator.warm_up()
         errors: dict[str, list[float]] = {}
         seconds: dict[str, list[float]] = {}

@@ -43,10 +43,10 @@ HOPELESS = 0.1
 """Beside a hand, an object that scores less at first sight gets no second look: it would cost the next image."""
 FRAME_S = 1 / 30
 """Time between images for smoothing, where the caller does not say."""
-SIDE_MEMORY = 0.9
-"""What a hand has shown of its side fades by this factor each image: about ten images decide."""
+SIDE_MEMORY = 0.95
+"""What a hand has shown of its side fades by this factor each image: about twenty images decide."""
 SETTLED = 5.0
-"""A side that has shown itself by more than this (logits) is not doubted until that has faded: about every seventh
+"""A side that has shown itself by more than this (logits) is not doubted until that has faded: about every tenth
 image. The scores of networks that do not judge sides never get there."""
 USUAL_SIZE = 0.166
 """Metres from the wrist along the bones to the tip of the middle finger, of the hand that a usual cube is for."""

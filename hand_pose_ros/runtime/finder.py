@@ -33,7 +33,7 @@ MOST = 6
 class Finder:
     """Depth images to cubes around what looks like a hand; as `detection.candidates`, by a network.
 
-    Always on the CPU: it takes two or three milliseconds there, and is needed while there is no hand, or to find another.
+    Always on the CPU: it takes two or three milliseconds there, and is needed while there is no hand, or for another.
 
     Args:
         network: `models.finder.HandFinder`.

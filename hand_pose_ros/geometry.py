@@ -17,8 +17,8 @@ from hand_pose_ros.errors import InputError
 
 PATCH_SIZE = 128
 """Width and height of a patch in pixels (paper, section 3)."""
-MAX_SLOPE, MIN_SLOPE = 100.0, 1e-4
-"""Of the rays at the border of an image against the axis of the camera (89.4 degrees, and a fraction of a minute of
+MAX_SLOPE, MIN_SLOPE = 3.0, 1e-4
+"""Of the rays at the border of an image against the axis of the camera (71.6 degrees, and a fraction of a minute of
 arc). Beyond them the intrinsics are those of no lens."""
 
 

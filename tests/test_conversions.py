@@ -105,8 +105,8 @@ def test_rectified_images_take_p_and_raw_ones_k() -> None:
     camera.update(info(p=[400.0, 0, 300.0, 0, 0, 405.0, 200.0, 0, 0, 0, 1.0, 0]))
     assert camera.intrinsics(640, 480, Params()) == Intrinsics(400, 405, 300, 200, 640, 480)
     assert camera.intrinsics(640, 480, Params(use_rectified=False)) == Intrinsics(500, 510, 320, 240, 640, 480)
-    given_ = Params(intrinsics_fx=1.0, intrinsics_fy=2.0, intrinsics_cx=3.0, intrinsics_cy=4.0)
-    assert camera.intrinsics(10, 20, given_) == Intrinsics(1, 2, 3, 4, 10, 20)
+    given_ = Params(intrinsics_fx=11.0, intrinsics_fy=12.0, intrinsics_cx=3.0, intrinsics_cy=4.0)
+    assert camera.intrinsics(10, 20, given_) == Intrinsics(11, 12, 3, 4, 10, 20)
 
 
 def test_a_bad_projection_matrix_does_not_hold_up_raw_images() -> None:
@@ -125,7 +125,7 @@ def test_binning_and_region_of_interest() -> None:
 
 @pytest.mark.parametrize('k', [
     [1e-300, 0, 320, 0, 1e-300, 240, 0, 0, 1], [1e9, 0, 320, 0, 1e9, 240, 0, 0, 1],
-    [500, 0, 1e300, 0, 500, 240, 0, 0, 1]])
+    [500, 0, 1e300, 0, 500, 240, 0, 0, 1], [60, 0, 320, 0, 60, 240, 0, 0, 1]])
 def test_intrinsics_of_no_lens_are_refused(k: list[float]) -> None:
     """Found by fuzzing: areas became infinite, and the search for a hand ended in an IndexError."""
     camera = Camera('/camera_info')

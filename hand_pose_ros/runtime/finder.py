@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from hand_pose_ros.detection import Region
-from hand_pose_ros.errors import CheckpointError, InputError
+from hand_pose_ros.errors import CheckpointError
 from hand_pose_ros.geometry import Cube, Intrinsics
 from hand_pose_ros.models.checkpoints import WEIGHTS, load_checkpoint
 from hand_pose_ros.models.finder import FOCAL, MULTIPLE
@@ -24,8 +24,6 @@ SHIPPED = WEIGHTS / 'detection' / 'hand_finder.safetensors'
 
 MIN_SCORE = 0.1
 """Places that score less are not worth a look."""
-WIDEST = 768
-"""Pixels of the network's camera, which has 143 degrees with them: no lens without distortion sees more."""
 MOST = 6
 """Places, the likeliest, that are told of one image."""
 
@@ -65,8 +63,9 @@ class Finder:
         The whole image is looked at, whatever the regions are: where an arm is cut off, it ends like a hand.
 
         Raises:
-            InputError: the camera sees more than any camera without distortion can.
+            InputError: no camera can have these intrinsics.
         """
+        intrinsics.check_lens()
         rows, columns, height, width = _grid(intrinsics)
         small = depth[rows[:, None], columns]
         image = np.zeros((1, 1, height, width), np.float32)
@@ -100,9 +99,6 @@ def _grid(intrinsics: Intrinsics) -> tuple[NDArray[np.int64], NDArray[np.int64],
     """Which rows and columns of a camera's image a camera of FOCAL pixels would see, and the size of its image."""
     def line(length: int, focal: float) -> tuple[NDArray[np.int64], int]:
         number = max(1, int(length * FOCAL / focal))
-        if number > WIDEST:
-            raise InputError(f'a focal length of {focal:g} pixels in an image of {length} means a view of '
-                             f'{2 * math.degrees(math.atan(length / focal / 2)):.0f} degrees: check the intrinsics')
         taken = ((np.arange(number) + 0.5) * focal / FOCAL).astype(np.int64).clip(max=length - 1)
         return taken, -(-number // MULTIPLE) * MULTIPLE
     (rows, height), (columns, width) = line(intrinsics.height, intrinsics.fy), line(intrinsics.width, intrinsics.fx)

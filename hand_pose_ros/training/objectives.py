@@ -127,14 +127,14 @@ class FinderObjective(PoseObjective):
         spread = (self.SPREAD / z).clamp(min=0.7 * CELL / FOCAL)[..., None, None]
         near = torch.exp(-0.5 * (apart / spread).square()) * hands[..., None, None]
         target, whose = near.max(dim=1)
-        number = hands.sum().clamp(min=1)
         quality = (target - logits.sigmoid()).square()
         score = F.binary_cross_entropy_with_logits(logits, target, reduction='none') * quality
 
         mine = truth[torch.arange(len(truth), device=truth.device)[:, None, None], whose].permute(0, 3, 1, 2)
         off = (middles - mine) * torch.cat([(1 + mine[:, 2:]).expand(-1, 2, -1, -1), torch.ones_like(mine[:, 2:])], 1)
         place = F.smooth_l1_loss(off, torch.zeros_like(off), reduction='none', beta=0.01).sum(1)
-        return {'score': score.sum() / number, 'place': 2 * (place * target * (target > 0.2)).sum() / number}
+        # Per image, of which there are as many in every process; an image has about one hand.
+        return {'score': score.sum() / len(depth), 'place': 2 * (place * target * (target > 0.2)).sum() / len(depth)}
 
     def predict(self, patch: Tensor) -> Tensor:
         """(B, 1, H, W) metres -> the middle of the likeliest hand (B, 1, 3)."""

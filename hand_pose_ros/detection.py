@@ -1,4 +1,4 @@
-"""Where in a depth image a hand may be: depth -> cubes.
+"""Where in a depth image a hand may be: depth -> cubes. (`runtime.finder` says it by a network.)
 
 The paper's assumption is that the hand is the nearest object to the camera (section 3; Oberweger et al. 2015). Its
 detector is kept, with sizes in metres instead of pixels, no bias at the border of the image, and a minimum size.

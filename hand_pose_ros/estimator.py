@@ -22,6 +22,7 @@ from hand_pose_ros.detection import MAX_THROUGH, Region, candidates, holds_a_han
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.geometry import PATCH_SIZE, Cube, Intrinsics, crop
 from hand_pose_ros.models.checkpoints import load_checkpoint
+from hand_pose_ros.models.dense import TOLD_SIZE
 from hand_pose_ros.runtime import Engine, default_threads, make_engine
 from hand_pose_ros.runtime.finder import Finder
 from hand_pose_ros.scoring import explain, learned
@@ -292,8 +293,8 @@ class HandPoseEstimator:
             if mirrored[shown]:
                 coordinates[:, 0] *= -1
             size = 0.0
-            if 'size' in answer:  # over 0.19 m in a cube of 0.30 m, see `training.objectives`
-                size = float(answer['size'][shown]) + math.log(0.19 / 0.30 * cube.side / USUAL_SIZE)
+            if 'size' in answer:
+                size = float(answer['size'][shown]) + math.log(TOLD_SIZE * cube.side / USUAL_SIZE)
             return _Reading(cube, cube.from_cube(coordinates), confidence[shown], float(score[shown]), rightness, size)
 
     def _mirrorings(self, track: _Track) -> tuple[bool, ...]:

@@ -20,6 +20,9 @@ CELLS = 32
 """Cells along each side of the maps; one covers 4 x 4 pixels of the patch."""
 REACH = 0.8
 """Cells further from a joint than this, in cube units, do not vote for it."""
+TOLD_SIZE = 0.19 / 0.30
+"""A hand of this length, over the side of its cube, has the size that is told as 0: from the wrist along the bones to
+the tip of the middle finger."""
 SHARPNESS = 30.0
 """Weight of a vote: exp(SHARPNESS * closeness)."""
 
@@ -110,14 +113,7 @@ class HandDense(nn.Module):
         loss votes (B, J, 3), the joints before the prior, positions (B, 3, 32, 32), seen (B, 1, 32, 32),
         directions (B, J, 3, 32, 32), closeness (B, J, 32, 32).
         """
-        x = self.stem(patch)  # (B, w, 32, 32)
-        features = []
-        for stage in self.stages:
-            x = stage(x)
-            features.append(x)
-        fused = self.laterals[3](features[3])  # (B, 2w, 4, 4)
-        for lateral, feature in zip(self.laterals[2::-1], features[2::-1], strict=True):
-            fused = F.interpolate(fused, scale_factor=2, mode='nearest') + lateral(feature)
+        x, fused = pyramid(self.stem(patch), self.stages, self.laterals)  # (B, 8w, 4, 4) and (B, 2w, 32, 32)
         # Sums over a thousand cells need more than a half, and run along the cells whatever convolutions prefer.
         maps = self.maps(self.fuse(fused)).float().contiguous()
         directions = maps[:, :3 * self.joints].unflatten(1, (self.joints, 3))
@@ -125,7 +121,7 @@ class HandDense(nn.Module):
         positions, seen = cells(patch.float())
         with torch.autocast(patch.device.type, enabled=False):  # nor may training in half precision halve them
             votes, agreement = decode(positions, seen, directions, closeness)
-        summary = self.summary(torch.cat([features[3].mean(dim=(2, 3)), agreement.to(x.dtype)], dim=1))
+        summary = self.summary(torch.cat([x.mean(dim=(2, 3)), agreement.to(x.dtype)], dim=1))
         confidence = summary[:, :self.joints]
         with torch.autocast(patch.device.type, enabled=False):
             # The confidence is to say how sure a joint is, not to be bent into what serves the prior.
@@ -135,6 +131,19 @@ class HandDense(nn.Module):
             **dict(zip(('hand', 'side', 'size'), summary[:, self.joints:].unbind(1), strict=True)),
             'votes': votes, 'positions': positions, 'seen': seen, 'directions': directions, 'closeness': closeness,
         }
+
+
+def pyramid(x: Tensor, stages: nn.ModuleList, laterals: nn.ModuleList) -> tuple[Tensor, Tensor]:
+    """What the last of the stages sees, each of which but the first halves the size; and the sum of what all of them
+    see, each through its lateral, as large as the first (feature pyramid, Lin et al. 2017)."""
+    features = []
+    for stage in stages:
+        x = stage(x)
+        features.append(x)
+    fused = laterals[-1](x)
+    for lateral, feature in zip(laterals[-2::-1], features[-2::-1], strict=True):
+        fused = F.interpolate(fused, scale_factor=2, mode='nearest') + lateral(feature)
+    return x, fused
 
 
 class Residual(nn.Module):

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from hand_pose_ros.models.dense import Residual, conv_norm
+from hand_pose_ros.models.dense import Residual, conv_norm, pyramid
 
 FOCAL = 128.0
 """Focal length of the images, pixels: a hand at 1 m has about 23."""
@@ -70,14 +70,7 @@ class HandFinder(nn.Module):
         """
         with torch.autocast(depth.device.type, enabled=False):
             x = channels(depth.float())
-        x = self.stem(x)
-        features = []
-        for stage in self.stages:
-            x = stage(x)
-            features.append(x)
-        fused = self.laterals[3](features[3])
-        for lateral, feature in zip(self.laterals[2::-1], features[2::-1], strict=True):
-            fused = F.interpolate(fused, scale_factor=2, mode='nearest') + lateral(feature)
+        _, fused = pyramid(self.stem(x), self.stages, self.laterals)
         maps = self.maps(self.fuse(fused)).float()
         rays = cell_rays(maps)
         lateral_m = 0.1 * maps[:, 1:3]

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from hand_pose_ros.datasets import Batch, joints_in_metres
-from hand_pose_ros.models.dense import encode
+from hand_pose_ros.models.dense import TOLD_SIZE, encode
 from hand_pose_ros.models.finder import CELL, FOCAL, cell_rays
 from hand_pose_ros.skeleton import Skeleton
 from hand_pose_ros.synthetic.rng import Random
@@ -83,7 +83,7 @@ class DenseObjective(PoseObjective):
             right = (joints - truth).norm(dim=-1) * half[:, None] < self.CONFIDENT
             cube = batch['cube_center'], batch['cube_side']
             bones = joints_in_metres(truth, *cube)[:, self.middle_finger].diff(dim=1).norm(dim=-1)
-            size = torch.log((bones.sum(1) / batch['cube_side']).clamp(min=0.01) / (0.19 / 0.30))
+            size = torch.log((bones.sum(1) / batch['cube_side']).clamp(min=0.01) / TOLD_SIZE)
         extra = {
             'maps': maps * counts,
             'confidence': _binary(out['confidence'], right).mean(1) * counts,

@@ -51,12 +51,12 @@ def main() -> None:
     parser.add_argument('--json', type=Path)
     parser.add_argument('--overlays', type=Path, help='write one sheet of all frames for each model here')
     parser.add_argument('--min-score', type=float, help='(that of the estimator)')
-    parser.add_argument('--looks', type=int, default=hand_pose_ros.estimator.LOOKS,
+    parser.add_argument('--readings', type=int, default=hand_pose_ros.estimator.READINGS,
                         help='how often a cube is read, where its joints are not in its middle (%(default)s)')
     parser.add_argument('--detector', default='network', choices=('network', 'nearest'))
     parser.add_argument('--sides-known', action='store_true', help='tell the estimator whether it is a left hand')
     args = parser.parse_args()
-    hand_pose_ros.estimator.LOOKS = args.looks
+    hand_pose_ros.estimator.READINGS = args.readings
     frames = json.loads((args.frames / 'annotations.json').read_text())['frames']
     table: dict[str, dict[str, Any]] = {}
     for model in args.model:

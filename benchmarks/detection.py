@@ -14,6 +14,7 @@ import time
 
 import numpy as np
 
+from hand_pose_ros.cli.arguments import count
 from hand_pose_ros.estimator import HandPoseEstimator
 from hand_pose_ros.synthetic.generator import SyntheticHands
 
@@ -21,9 +22,9 @@ from hand_pose_ros.synthetic.generator import SyntheticHands
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--model', help='weights that ship, or a file')
-    parser.add_argument('--split', default='test')
+    parser.add_argument('--split', default='test', choices=('train', 'val', 'test'))
     parser.add_argument('--start', type=int, default=20_000, help='first scene')
-    parser.add_argument('--number', type=int, default=1000, help='scenes')
+    parser.add_argument('--number', type=count, default=1000, help='scenes')
     args = parser.parse_args()
     scenes = SyntheticHands(args.split)
     estimators = {name: HandPoseEstimator.from_pretrained(args.model, device='cpu', detector=name, tracking=False)

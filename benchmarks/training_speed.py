@@ -16,7 +16,7 @@ from hand_pose_ros.datasets.memory import keep_freed_memory
 from hand_pose_ros.models import build
 from hand_pose_ros.skeleton import HAND21
 from hand_pose_ros.training.augmentation import PRESETS, augment
-from hand_pose_ros.training.objectives import DenseObjective, PoseObjective
+from hand_pose_ros.training.objectives import objective_for
 from hand_pose_ros.training.optimizers import make_optimizer
 from hand_pose_ros.training.recipes import get_recipe
 
@@ -34,7 +34,7 @@ def training(network: str, recipe_name: str, precision: torch.dtype | None) -> f
     """Steps of a recipe on samples that are there already."""
     recipe = get_recipe(recipe_name)
     module = build(network, joints=21, bottleneck=30)
-    objective = (DenseObjective if network == 'hand_dense' else PoseObjective)(module, recipe, HAND21)
+    objective = objective_for(module, recipe, HAND21)
     objective.train().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = make_optimizer(recipe, objective)
     numbers = torch.arange(recipe.batch_size)
@@ -58,8 +58,8 @@ def main() -> None:
     batch = data.batch(numbers)
     print(f'render             {rate(128, lambda: data.batch(numbers)):7.0f}')
     print(f'augment (modern)   {rate(128, lambda: augment(batch, PRESETS["modern"], numbers, seed=0)):7.0f}')
-    for network in ('shallow', 'deep', 'multi_scale', 'hand_dense'):
-        recipe = 'modern' if network == 'hand_dense' else 'paper'
+    for network in ('shallow', 'deep', 'multi_scale', 'hand_dense', 'two_looks'):
+        recipe = 'modern' if network in ('hand_dense', 'two_looks') else 'paper'
         single, half = (training(network, recipe, precision) for precision in (None, torch.bfloat16))
         print(f'{network:18s} {single:7.0f}   bfloat16 {half:7.0f}')
 

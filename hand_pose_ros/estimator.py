@@ -33,8 +33,8 @@ Side = Literal['left', 'right', 'unknown']
 
 RECENTER_M = 0.015
 """A cube whose centre is further than this from the middle of the joints it gave is moved there and read again."""
-LOOKS = 3
-"""How often at most: on synthetic images two looks find a hand more often than one, and three more often than two."""
+READINGS = 3
+"""How often at most: on synthetic images two readings find a hand more often than one, three more often than two."""
 FALSE_ALARMS = 3
 """After so many objects that are no hand, the search is given up until the next image."""
 SEARCH_EVERY = 5
@@ -270,7 +270,7 @@ class HandPoseEstimator:
         What scores less than `hopeless` is not looked at again.
         """
         reading = self._predict(depth, intrinsics, cube, track)
-        for _ in range(LOOKS - 1):
+        for _ in range(READINGS - 1):
             center = reading.joints.mean(axis=0)
             if (np.linalg.norm(center - reading.cube.center) <= RECENTER_M or center[2] <= self.near
                     or reading.score < hopeless):

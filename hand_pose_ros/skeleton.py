@@ -31,6 +31,17 @@ class Skeleton:
         return tuple(next((f for f in FINGERS if name.startswith(f)), 'palm') for name in self.joint_names)
 
     @property
+    def knuckles(self) -> tuple[int, ...]:
+        """Indices of the joints that the fingers begin with, without the thumb; their parent is the root."""
+        return tuple(joint for joint, finger in enumerate(self.fingers)
+                     if self.parents[joint] == self.root and finger not in ('palm', 'thumb'))
+
+    @property
+    def root(self) -> int:
+        """Index of the joint without a parent."""
+        return self.parents.index(-1)
+
+    @property
     def tips(self) -> tuple[int, ...]:
         """Indices of the fingertips, thumb to little finger."""
         return tuple(self.joint_names.index(f'{finger}_tip') for finger in FINGERS)

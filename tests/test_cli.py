@@ -40,6 +40,13 @@ def test_bad_arguments_are_exit_code_2(arguments, capsys):
     assert exit_.value.code == 2
 
 
+def test_parameters_of_the_node_are_not_options_of_the_command(capsys):
+    with pytest.raises(SystemExit) as exit_:
+        main(['estimator', '--detector', 'nearest'])
+    assert exit_.value.code == 2
+    assert '--detector nearest (parameters are set with --ros-args -p NAME:=VALUE' in capsys.readouterr().err
+
+
 def test_failure_is_exit_code_1_and_one_sentence(tmp_path, capsys):
     assert main(['estimate', str(tmp_path / 'no_such_folder'), '--out', 'joints.npz']) == 1
     error = capsys.readouterr().err

@@ -12,6 +12,8 @@ from hand_pose_ros.models import ARCHITECTURES, build
 from hand_pose_ros.models.dense import cells, decode, encode
 from hand_pose_ros.models.prior import fit_prior
 from hand_pose_ros.models.refiner import Refiner
+from hand_pose_ros.models.two_looks import View
+from hand_pose_ros.skeleton import HAND21, SKELETONS
 
 POSE_NETWORKS = ('shallow', 'deep', 'deep_prior', 'multi_scale', 'resnet', 'hand_dense')
 REFINERS = ('std_ref', 'or_ref')
@@ -187,7 +189,7 @@ def test_build_remembers_everything_that_made_the_network():
     network = build('deep_prior', joints=14)
     assert network.architecture == 'deep_prior'
     assert network.config == {'joints': 14, 'bottleneck': 30, 'dropout': 0.3}
-    assert set(POSE_NETWORKS) | set(REFINERS) | {'center_refiner', 'hand_finder'} == set(ARCHITECTURES)
+    assert {*POSE_NETWORKS, *REFINERS, 'two_looks', 'center_refiner', 'hand_finder'} == set(ARCHITECTURES)
 
 
 def test_the_center_refiner_sees_fine_the_middle_and_coarsely_the_rest():
@@ -334,3 +336,90 @@ def test_dense_network_says_everything_and_survives_an_empty_patch():
     assert all(tensor.isfinite().all() for tensor in answer.values())
     torch.testing.assert_close(network(patches), answer['joints'])
     assert parameters(build('hand_dense', width=16)) < parameters(network) / 3
+
+
+def a_hand(count: int = 6) -> tuple[torch.Tensor, torch.Tensor]:
+    """Joints like those of hands that are turned any way, and what is told of their size."""
+    rng = np.random.default_rng(3)
+    upright = rng.normal(0, 0.12, (count, 21, 3))
+    upright[:, list(HAND21.knuckles), 1] -= 0.3
+    angle = torch.from_numpy(rng.uniform(-np.pi, np.pi, count))
+    turn = torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()], 1).view(-1, 2, 2)
+    joints = torch.from_numpy(upright + rng.normal(0, 0.1, (count, 1, 3)))
+    joints[..., :2] = joints[..., :2] @ turn
+    return joints.float(), torch.from_numpy(rng.normal(0, 0.1, count)).float()
+
+
+def test_the_second_look_sees_every_hand_upright_in_the_middle_and_equally_large():
+    joints, size = a_hand()
+    network = build('two_looks', width=4)
+    view = network.upright(joints, size)
+    seen = view.into(joints)
+    assert seen.mean(1).abs().max() < 0.02  # a pixel, to which views are rounded
+    up = seen[:, list(HAND21.knuckles)].mean(1) - seen[:, 0]
+    assert (up[:, 1] < 0).all() and (up[:, 0] / up[:, 1]).abs().max() < 0.02
+    width, seen_width = ((points - points.mean(1, keepdim=True)).square().sum((1, 2)).sqrt()
+                         for points in (joints, seen))
+    torch.testing.assert_close(seen_width * size.exp(), width / 0.95, rtol=0.01, atol=0)
+    torch.testing.assert_close(view.back(seen), joints, atol=1e-6, rtol=0)
+    # One that points at the camera, and one of which nothing is known, are seen somehow.
+    assert all(part.isfinite().all() for part in network.upright(torch.zeros(1, 21, 3), torch.zeros(1)))
+
+
+def test_readings_are_seen_where_points_are_seen():
+    view = build('two_looks', width=4).upright(*a_hand())
+    rng = np.random.default_rng(0)
+    for i in range(6):
+        row, column = rng.integers(30, 98, 2)
+        patch = torch.ones(6, 1, 128, 128)
+        patch[i, 0, row - 2:row + 3, column - 2:column + 3] = 0.25
+        point = torch.tensor([(column + 0.5) / 64 - 1, (row + 0.5) / 64 - 1, 0.25]).float().repeat(6, 1, 1)
+        x, y, z = view.into(point)[i, 0].tolist()
+        seen = view.patch(patch)
+        rows, columns = (seen[i, 0] < 1).nonzero(as_tuple=True)
+        assert abs(z) < 1 and abs(columns.float().mean() - (x + 1) * 64 + 0.5) < 0.6
+        assert abs(rows.float().mean() - (y + 1) * 64 + 0.5) < 0.6
+        torch.testing.assert_close(seen[i, 0, rows, columns], torch.full((len(rows),), z))
+        assert (seen[torch.arange(6) != i] == 1).all()
+    # What lies beyond the patch is background, and so is what lies behind the back of the view.
+    aside = View(torch.tensor([[0.9, 0.0, 0.0]]), torch.eye(2)[None], torch.ones(1))
+    assert (aside.patch(torch.zeros(1, 1, 128, 128))[..., 72:] == 1).all()
+    near = View(torch.tensor([[0.0, 0.0, -0.5]]), torch.eye(2)[None], torch.full((1,), 0.5))
+    assert (near.patch(torch.full((1, 1, 128, 128), 0.2)) == 1).all()
+
+
+def test_a_turn_of_the_patch_is_not_seen_by_the_second_look():
+    patch, (joints, size) = hand_patches(6), a_hand()
+    network = build('two_looks', width=4)
+    turned = torch.stack([-joints[..., 1], joints[..., 0], joints[..., 2]], dim=-1)
+    view, other = network.upright(joints, size), network.upright(turned, size)
+    seen, same = view.patch(patch), other.patch(patch.rot90(-1, (2, 3)))
+    assert (seen < 1).float().mean() > 0.1 and (seen != same).float().mean() < 1e-3
+    torch.testing.assert_close(view.into(joints), other.into(turned), atol=1e-5, rtol=0)
+
+
+def test_two_looks_say_everything_of_the_patch_as_it_is():
+    network = build('two_looks', width=8).eval()
+    patches = torch.cat([hand_patches(2), torch.ones(1, 1, 128, 128)])
+    answer, view = network.forward_full(patches), network.view(patches)
+    seen = network.second.forward_full(view.patch(patches))
+    assert answer.keys() == set(network.outputs)
+    torch.testing.assert_close(view.into(answer['joints']), seen['joints'], atol=1e-5, rtol=0)
+    torch.testing.assert_close(answer['size'], seen['size'] + torch.log(view.scale))
+    torch.testing.assert_close(network(patches), answer['joints'])
+    answer['joints'].sum().backward()
+    assert {name.split('.')[0] for name, p in network.named_parameters() if p.grad is not None} == {'second'}
+    assert not network.train().first.training and network.second.training
+
+
+def test_a_hand_without_these_joints_has_no_upright():
+    with pytest.raises(HandPoseError, match=r'root 0 and knuckles \[5, 9, 13, 17\] are not all among 14 joints'):
+        build('two_looks', joints=14)
+
+
+@pytest.mark.parametrize('skeleton', SKELETONS.values(), ids=SKELETONS)
+def test_every_skeleton_has_four_knuckles_and_a_root(skeleton):
+    assert [skeleton.fingers[joint] for joint in sorted(skeleton.knuckles, key=lambda j: skeleton.fingers[j])] == [
+        'index', 'middle', 'pinky', 'ring']
+    assert skeleton.parents[skeleton.root] == -1 and skeleton.fingers[skeleton.root] == 'palm'
+    build('two_looks', joints=len(skeleton), root=skeleton.root, knuckles=skeleton.knuckles, width=4)

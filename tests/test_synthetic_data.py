@@ -256,6 +256,8 @@ def test_command_line_shows_writes_and_measures(tmp_path, capsys, shared_data):
 
     assert main(['synth', 'show', str(sheet), '--sensors', 'kinect9']) == 1
     assert "unknown sensor 'kinect9'" in capsys.readouterr().err
+    assert main(['synth', 'show', str(tmp_path / 'sheet.jpeg2')]) == 1
+    assert 'give a name that ends in .png' in capsys.readouterr().err
 
 
 def test_benchmark_is_the_frozen_one():

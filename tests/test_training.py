@@ -29,7 +29,7 @@ from hand_pose_ros.training.augmentation import PRESETS, Augmentation, augment
 from hand_pose_ros.training.folder import TrainingError
 from hand_pose_ros.training.loop import Machine, Run
 from hand_pose_ros.training.losses import joint_loss
-from hand_pose_ros.training.objectives import DenseObjective
+from hand_pose_ros.training.objectives import objective_for
 from hand_pose_ros.training.optimizers import learning_rate
 from hand_pose_ros.training.recipes import RECIPES, get_recipe, recipe_from_dict, recipe_to_dict
 from hand_pose_ros.training.stream import SampleStream
@@ -511,12 +511,45 @@ def test_a_network_starts_from_another_and_gets_a_prior_if_that_had_none(folder,
         tiny(folder, f'base={path}', out=tmp_path / 'third')
 
 
-def test_the_heads_of_a_dense_network_are_trained_for_what_they_say():
+def test_the_second_look_learns_behind_a_first_which_stays(folder, tmp_path):
+    facts = {'skeleton': 'icvl16', 'cube_side': 0.3}
+    small, large = tmp_path / 'small.safetensors', tmp_path / 'large.safetensors'
+    save_checkpoint(small, build('hand_dense', joints=16, width=4, bottleneck=8), facts)
+    save_checkpoint(large, build('hand_dense', joints=16, width=8, bottleneck=8), facts)
+    wanted = ('network=two_looks', 'options.width=8', 'options.bottleneck=8')
+    for base in ('none', large):
+        with pytest.raises(TrainingError, match='--set first=FILE'):
+            tiny(folder, *wanted, f'base={base}', out=tmp_path / 'never')
+    run = tiny(folder, *wanted, f'first={small}', f'base={large}', 'samples=40', recipe='modern', out=tmp_path / 'run')
+    network, base = run.objective.network, load_checkpoint(large).network.state_dict()
+    assert network.config['knuckles'] == (4, 7, 10, 13) and network.config['first'] == {'width': 4, 'bottleneck': 8}
+    second = network.second.state_dict()
+    equal = {name for name in base if torch.equal(base[name], second[name])}
+    assert all(name.startswith('head.') for name in base.keys() - equal) and len(equal) < len(base)
+    # The prior is one of poses as they are seen: upright.
+    mean = network.second.head.reconstruction.bias.detach().view(16, 3)
+    assert mean[:, :2].mean(0).abs().max() < 0.02
+    assert mean[list(network.knuckles), 1].mean() < mean[0, 1] - 0.05
+    run.train()
+    last = tmp_path / 'run' / 'last.safetensors'
+    trained, kept = load_checkpoint(last).network.state_dict(), load_checkpoint(small).network.state_dict()
+    assert all(torch.equal(trained[f'first.{name}'], value) for name, value in kept.items())
+    assert not torch.equal(trained['second.maps.weight'], base['maps.weight'])
+    # And on, from two looks; or with another first.
+    again = tiny(folder, *wanted, f'base={last}', out=tmp_path / 'again').objective.network.state_dict()
+    assert all(torch.equal(value, trained[name]) for name, value in again.items())
+    other = tiny(folder, *wanted, f'base={last}', f'first={large}', out=tmp_path / 'other').objective.network
+    assert torch.equal(other.first.maps.weight, base['maps.weight'])
+    assert torch.equal(other.second.maps.weight, trained['second.maps.weight'])
+
+
+@pytest.mark.parametrize('architecture', ['hand_dense', 'two_looks'])
+def test_the_heads_of_a_dense_network_are_trained_for_what_they_say(architecture):
     """Each term falls when its head is right, and joints of mirrored or absent hands teach nothing."""
     torch.manual_seed(0)
     recipe = get_recipe('modern')
-    network = build('hand_dense', joints=21, width=8)
-    objective = DenseObjective(network, recipe, HAND21)
+    network = build(architecture, joints=21, width=8)
+    objective = objective_for(network, recipe, HAND21)
     batch = sample()
     batch = {**batch, 'joints': batch['joints'][:, :21], 'mirrored': torch.tensor([False, False, True, False]),
              'hand_present': torch.tensor([True, True, True, False])}

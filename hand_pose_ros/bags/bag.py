@@ -125,14 +125,16 @@ def _open(path: Path) -> tuple[AnyReader, bool]:
 
 
 def _remedy(path: Path) -> str:
+    if path.is_file() and not path.stat().st_size:
+        return 'it is empty: record or copy it again'
     if path.suffix == '.bag':
         return f'if it was cut short, repair a copy with: rosbag reindex {path.name}'
     if path.suffix == '.mcap':
         return f'repair it with: mcap recover {path.name} -o repaired.mcap'
     if path.suffix == '.db3':
         return f'repair it with: sqlite3 {path.name} .recover | sqlite3 repaired.db3'
-    return ('give a .bag, .mcap or .db3 file or the folder of a ROS 2 bag, or repair that folder with: '
-            f'ros2 bag reindex {path.name}')
+    wanted = 'give a .bag, .mcap or .db3 file or the folder of a ROS 2 bag'
+    return f'{wanted}, or repair that folder with: ros2 bag reindex {path.name}' if path.is_dir() else wanted
 
 
 class _InterruptedMcap:

@@ -45,7 +45,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             module.add_parser(subparsers)
         else:
             subparsers.add_parser(verb, help=summary)
-    args = parser.parse_args(argv)
+    args, unknown = parser.parse_known_args(argv)
+    if unknown:
+        hint = getattr(module, 'HINT', 'see --help')
+        subparsers.choices[args.verb].error(f'unrecognized arguments: {" ".join(unknown)} ({hint})')
     try:
         return module.run(args)
     except HandPoseError as error:

@@ -14,6 +14,8 @@ EXAMPLES = """examples:
 Depth images come in on depth/image_rect, with depth/camera_info; joints go out on hand/joints.
 """
 
+HINT = 'parameters are set with --ros-args -p NAME:=VALUE; --parameters lists them'
+
 
 def add_parser(subparsers: Any) -> None:
     """Add this verb to the command line."""

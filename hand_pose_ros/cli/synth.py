@@ -108,6 +108,8 @@ def _show(args: argparse.Namespace) -> None:
     from hand_pose_ros.synthetic.sensors import SENSORS
     from hand_pose_ros.synthetic.stages import Ingredients
 
+    if not cv2.haveImageWriter(str(args.out)):
+        raise HandPoseError(f'{args.out}: pictures of this kind cannot be written: give a name that ends in .png')
     names = args.sensors or [sensor.name for sensor in SENSORS]
     number = args.number if not args.per_sensor else min(args.number, _COLUMNS)
     pictures = []

@@ -43,7 +43,7 @@ def curves(results: Sequence[Result]) -> Figure:
     right.set(title='Joints within', ylabel='joints, %')
     for axes in (left, right):
         axes.set(xlim=(0, 80), ylim=(0, 100), xlabel='distance, mm')
-        axes.legend(loc='lower right', fontsize=9)
+        axes.legend(loc='best', fontsize=9)  # where it covers least
     return figure
 
 

@@ -15,6 +15,7 @@ from hand_pose_ros.models.finder import HandFinder
 from hand_pose_ros.models.prior_net import CenterRefiner, Deep, MultiScale, Shallow
 from hand_pose_ros.models.refiner import ORRef, StdRef
 from hand_pose_ros.models.resnet import ResNet
+from hand_pose_ros.models.two_looks import TwoLooks
 
 ARCHITECTURES: dict[str, Callable[..., nn.Module]] = {
     'shallow': Shallow,
@@ -23,6 +24,7 @@ ARCHITECTURES: dict[str, Callable[..., nn.Module]] = {
     'multi_scale': MultiScale,
     'resnet': ResNet,
     'hand_dense': HandDense,
+    'two_looks': TwoLooks,
     'center_refiner': CenterRefiner,
     'hand_finder': HandFinder,
     'std_ref': StdRef,

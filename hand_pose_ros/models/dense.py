@@ -82,7 +82,7 @@ class HandDense(nn.Module):
 
     def __init__(self, joints: int = 21, width: int = 32, bottleneck: int | None = None) -> None:
         super().__init__()
-        self.joints = joints
+        self.joints, self.width, self.bottleneck = joints, width, bottleneck
         w = width
         self.stem = nn.Sequential(conv_norm(1, w, 5, stride=2), nn.ReLU(), nn.MaxPool2d(2))
         self.stages = nn.ModuleList([Residual(w, w, 1), Residual(w, 2 * w, 2),

@@ -71,4 +71,4 @@ class CudaEngine(Engine):
         return _Captured(graph, source, targets)
 
     def _compute(self, source: Tensor) -> tuple[Tensor, ...]:
-        return self.pipeline(source.to(self.device, non_blocking=True).half())
+        return self.pipeline(source.to(self.device, non_blocking=True))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 
 import numpy as np
@@ -11,6 +12,7 @@ from torch import Tensor, nn
 
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.geometry import PATCH_SIZE
+from hand_pose_ros.models.two_looks import TwoLooks
 
 Array = NDArray[np.float32]
 
@@ -23,14 +25,28 @@ class Pipeline(nn.Module):
         self.network, self.refiner = network, refiner
         self.outputs: tuple[str, ...] = getattr(network, 'outputs', ('joints',))
 
+    def half(self) -> Pipeline:
+        """In half precision, but for a first look: that of the second is rounded, and must not depend on it."""
+        first = copy.deepcopy(self.network.first) if isinstance(self.network, TwoLooks) else None
+        super().half()
+        if first is not None:
+            self.network.first = first
+        return self
+
     def forward(self, patches: Tensor) -> tuple[Tensor, ...]:
+        """Patches (B, 1, 128, 128) float32 -> what `outputs` name, float32."""
         full = getattr(self.network, 'forward_full', None)
-        answer: dict[str, Tensor] = {'joints': self.network(patches)} if full is None else full(patches)
+        own = patches.to(_precision(self.network))
+        answer: dict[str, Tensor] = {'joints': self.network(own)} if full is None else full(own)
         if self.refiner is not None:
-            answer['joints'] = self.refiner(patches, answer['joints'])
+            answer['joints'] = self.refiner(patches.to(_precision(self.refiner)), answer['joints'])
         # Where nothing is to be cast, the exported graph shall not try to.
         return tuple(value if value.dtype == torch.float32 else value.float()
                      for value in (answer[name] for name in self.outputs))
+
+
+def _precision(module: nn.Module) -> torch.dtype:
+    return next((parameter.dtype for parameter in module.parameters()), torch.float32)
 
 
 class Engine(ABC):

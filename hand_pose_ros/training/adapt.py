@@ -34,7 +34,7 @@ from hand_pose_ros.synthetic.crops import to_cube
 from hand_pose_ros.training.augmentation import Augmentation, augment
 from hand_pose_ros.training.fitting import fit_hand
 from hand_pose_ros.training.losses import Terms
-from hand_pose_ros.training.objectives import DenseObjective, PoseObjective
+from hand_pose_ros.training.objectives import objective_for
 from hand_pose_ros.training.optimizers import learning_rate, make_optimizer
 from hand_pose_ros.training.recipes import RECIPES
 
@@ -219,8 +219,8 @@ def fine_tune(network: nn.Module, recorded: Batch, synthetic: Batch, steps: int,
     original = list(network.parameters())
     network = copy.deepcopy(network).requires_grad_(True).eval()  # norms keep their statistics: two sorts of samples
     recipe = replace(RECIPES['modern'], learning_rate=RATE, warmup=0.1)
-    kind = DenseObjective if hasattr(network, 'forward_full') else PoseObjective
-    objective = kind(network, recipe, HAND21).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    objective = objective_for(network, recipe, HAND21)
+    objective = objective.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = make_optimizer(recipe, network)
     order = torch.Generator().manual_seed(recipe.seed)
     for step in progress(range(steps), steps):

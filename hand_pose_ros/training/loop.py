@@ -25,16 +25,12 @@ from hand_pose_ros.datasets.memory import keep_freed_memory
 from hand_pose_ros.datasets.shards import DiskShards, MemoryShards
 from hand_pose_ros.models import build
 from hand_pose_ros.models.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
+from hand_pose_ros.models.dense import HandDense
 from hand_pose_ros.models.prior import fit_prior
+from hand_pose_ros.models.two_looks import TwoLooks
 from hand_pose_ros.training.augmentation import PRESETS, augment
 from hand_pose_ros.training.folder import RunFolder, TrainingError
-from hand_pose_ros.training.objectives import (
-    CenterObjective,
-    DenseObjective,
-    FinderObjective,
-    PoseObjective,
-    RefinerObjective,
-)
+from hand_pose_ros.training.objectives import PoseObjective, RefinerObjective, objective_for
 from hand_pose_ros.training.optimizers import learning_rate, make_optimizer
 from hand_pose_ros.training.recipes import EPOCH_OF_ENDLESS_DATA, Recipe, recipe_to_dict
 from hand_pose_ros.training.state import load_state, save_state, save_tensors
@@ -42,8 +38,6 @@ from hand_pose_ros.training.stream import SampleStream
 from hand_pose_ros.training.validation import estimate, first_samples
 
 log = logging.getLogger(__name__)
-
-_OF_NO_JOINTS: dict[str, type[PoseObjective]] = {'center_refiner': CenterObjective, 'hand_finder': FinderObjective}
 
 CUBE_SIDE = 0.30
 """Metres; what a checkpoint recommends to whoever runs it."""
@@ -138,45 +132,69 @@ class Run:
             if base is None:
                 raise TrainingError('a refiner needs the checkpoint that it corrects: --set base=FILE')
             return RefinerObjective(build(recipe.refiner, joints=joints), base.network, recipe, self.skeleton)
-        of_joints = recipe.network not in _OF_NO_JOINTS
+        of_joints = recipe.network not in ('center_refiner', 'hand_finder')
         if (recipe.network == 'hand_finder') != (recipe.dataset == 'scenes'):
             raise TrainingError(f'{recipe.network} cannot learn from {recipe.dataset}: hand_finder, and nothing else, '
                                 'is trained with dataset=scenes')
         if recipe.network == 'hand_finder' and recipe.augmentation != PRESETS['none']:
             raise TrainingError('hand_finder has its own augmentation: leave out --set augmentation')
-        network = build(recipe.network, **({'joints': joints} if of_joints else {}), **recipe.options)
+        given: dict[str, Any] = {'joints': joints} if of_joints else {}
+        first = None
+        if recipe.network == 'two_looks':
+            first = self._first_look(base)
+            given |= {'root': self.skeleton.root, 'knuckles': self.skeleton.knuckles,
+                      'first': {'width': first.width, 'bottleneck': first.bottleneck}}
+        network = build(recipe.network, **given, **recipe.options)
+        if first is not None:
+            network.first.load_state_dict(first.state_dict())  # type: ignore[union-attr]
+        objective = objective_for(network, recipe, self.skeleton)
         bottleneck = recipe.options.get('bottleneck')
         has_prior = base is not None and self._start_from(network, base)
         if bottleneck and not has_prior:
-            prior = fit_prior(self._training_poses(), bottleneck)
+            prior = fit_prior(self._training_poses(objective), bottleneck)
             network.set_prior(prior.mean, prior.components)  # type: ignore[operator]
             log.info('the prior keeps %.2f %% of the variance of the poses', 100 * prior.explained_variance_ratio.sum())
         if bottleneck and not recipe.train_prior:
             network.head.reconstruction.requires_grad_(False)  # type: ignore[union-attr]
-        dense = hasattr(network, 'forward_full')
-        kind = _OF_NO_JOINTS.get(recipe.network, DenseObjective if dense else PoseObjective)
-        return kind(network, recipe, self.skeleton)
+        return objective
+
+    def _first_look(self, base: Checkpoint | None) -> Any:
+        """The network that tells the second look where to look."""
+        named = load_checkpoint(self.recipe.first).network if self.recipe.first else None
+        first = getattr(base.network, 'first', None) if named is None and base else named
+        if not isinstance(first, HandDense) or first.joints != len(self.skeleton):
+            raise TrainingError(f'two_looks of {self.skeleton.name} need a hand_dense of these joints as the first: '
+                                '--set first=FILE')
+        return first
 
     def _start_from(self, network: nn.Module, base: Checkpoint) -> bool:
-        """Take the weights of the base; False if it has none for the prior, which is all that it may lack."""
-        weights = {**network.state_dict(), **base.network.state_dict()}
-        lacking = network.state_dict().keys() - base.network.state_dict().keys()
+        """Take the weights of the base; False if it has none for the prior, which is all that it may lack.
+
+        The second of two looks may start as any hand_dense, but that its prior is another.
+        """
+        own = base.network.state_dict()
+        if isinstance(network, TwoLooks):
+            if isinstance(base.network, HandDense):
+                own = {f'second.{name}': value for name, value in own.items() if not name.startswith('head.')}
+            own |= {f'first.{name}': value for name, value in network.first.state_dict().items()}
+        lacking = network.state_dict().keys() - own.keys()
         try:
-            if not all(name.startswith('head.') for name in lacking):
+            if not all('head' in name.split('.') for name in lacking):
                 raise RuntimeError(f'{min(lacking)} is missing')
-            network.load_state_dict(weights)
+            network.load_state_dict({**network.state_dict(), **own})
         except RuntimeError as error:
             raise TrainingError(f'{self.recipe.base} holds another network than the recipe names '
                                 f'({self.recipe.network}, {self.recipe.options})') from error
         return not lacking
 
-    def _training_poses(self) -> Tensor:
+    def _training_poses(self, objective: PoseObjective) -> Tensor:
         """Poses as the network will meet them: one shard, augmented in several ways, is plenty for a covariance."""
         samples = self.shards.read(self.stream.first)
         samples = {key: value.cpu() for key, value in samples.items() if key != 'patch'}
         count, turns = len(samples['joints']), 8
         numbers = torch.arange(turns * count).split(count)
-        poses = [augment(samples, self.recipe.augmentation, some, self.recipe.seed)['joints'] for some in numbers]
+        poses = [objective.poses(augment(samples, self.recipe.augmentation, some, self.recipe.seed))
+                 for some in numbers]
         return torch.cat(poses)[samples['hand_present'].repeat(turns)]
 
     # The loop

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from hand_pose_ros.datasets import Batch, joints_in_metres
 from hand_pose_ros.models.dense import TOLD_SIZE, encode
 from hand_pose_ros.models.finder import CELL, FOCAL, cell_rays
+from hand_pose_ros.models.two_looks import TwoLooks
 from hand_pose_ros.skeleton import Skeleton
 from hand_pose_ros.synthetic.rng import Random
 from hand_pose_ros.training.losses import Terms, joint_loss
@@ -29,6 +30,10 @@ class PoseObjective(nn.Module):
     def forward(self, batch: Batch) -> Terms:
         joints, truth = self.predict(batch['patch']).float(), batch['joints'][:, self.joints]
         return {'joints': joint_loss(self.recipe.loss, self.recipe.knee, joints, truth, _counts(batch))}
+
+    def poses(self, batch: Batch) -> Tensor:
+        """What the network has to give for these samples, (B, J, 3): the prior is one of such poses."""
+        return batch['joints']
 
     def predict(self, patch: Tensor) -> Tensor:
         """(B, 1, 128, 128) -> joints (B, J, 3) in cube units, after training."""
@@ -71,7 +76,12 @@ class DenseObjective(PoseObjective):
 
     def forward(self, batch: Batch) -> Terms:
         out = self.network.forward_full(batch['patch'])  # type: ignore[operator]
-        truth, counts, half = batch['joints'], _counts(batch), batch['cube_side'] / 2
+        return self._terms(out, batch, batch['joints'], batch['joints'].new_ones(()))
+
+    def _terms(self, out: dict[str, Tensor], batch: Batch, truth: Tensor, scale: Tensor) -> Terms:
+        """The loss of an answer to a batch whose joints (B, J, 3) are in units of the cube, or of one that
+        is smaller by this factor (B,)."""
+        counts, half = _counts(batch), batch['cube_side'] / 2 * scale
         joints = out['joints'].float()
         directions, closeness = encode(out['positions'], truth)
         seen = out['seen']  # (B, 1, 32, 32)
@@ -81,9 +91,7 @@ class DenseObjective(PoseObjective):
 
         with torch.no_grad():
             right = (joints - truth).norm(dim=-1) * half[:, None] < self.CONFIDENT
-            cube = batch['cube_center'], batch['cube_side']
-            bones = joints_in_metres(truth, *cube)[:, self.middle_finger].diff(dim=1).norm(dim=-1)
-            size = torch.log((bones.sum(1) / batch['cube_side']).clamp(min=0.01) / TOLD_SIZE)
+            size = self._size(batch) - scale.log()
         extra = {
             'maps': maps * counts,
             'confidence': _binary(out['confidence'], right).mean(1) * counts,
@@ -93,6 +101,26 @@ class DenseObjective(PoseObjective):
         }
         return {'joints': joint_loss(self.recipe.loss, self.recipe.knee, joints, truth, counts),
                 **{name: _WEIGHTS[name] * value.mean() for name, value in extra.items()}}
+
+    def _size(self, batch: Batch) -> Tensor:
+        """The logarithm (B,) of the hands' length over the usual one of their cubes."""
+        cube = batch['cube_center'], batch['cube_side']
+        bones = joints_in_metres(batch['joints'], *cube)[:, self.middle_finger].diff(dim=1).norm(dim=-1)
+        return torch.log((bones.sum(1) / batch['cube_side']).clamp(min=0.01) / TOLD_SIZE)
+
+
+class SecondLookObjective(DenseObjective):
+    """The second of two looks, at the hand as the first one finds it: the errors it makes in use, it makes here."""
+
+    network: TwoLooks
+
+    def forward(self, batch: Batch) -> Terms:
+        view = self.network.view(batch['patch'])
+        out = self.network.second.forward_full(view.patch(batch['patch']))
+        return self._terms(out, batch, view.into(batch['joints']), view.scale)
+
+    def poses(self, batch: Batch) -> Tensor:
+        return self.network.upright(batch['joints'], self._size(batch)).into(batch['joints'])
 
 
 class FinderObjective(PoseObjective):
@@ -177,6 +205,17 @@ class RefinerObjective(nn.Module):
     def _estimate(self, patch: Tensor) -> Tensor:
         with torch.no_grad():
             return self._base[0].to(patch.device)(patch).float()
+
+
+OBJECTIVES: dict[str, type[PoseObjective]] = {
+    'hand_dense': DenseObjective, 'two_looks': SecondLookObjective, 'center_refiner': CenterObjective,
+    'hand_finder': FinderObjective}
+"""By architecture, of those that are to do something else than to predict joints."""
+
+
+def objective_for(network: nn.Module, recipe: Recipe, skeleton: Skeleton) -> PoseObjective:
+    """What a network, made by `models.build`, is trained for."""
+    return OBJECTIVES.get(str(vars(network)['architecture']), PoseObjective)(network, recipe, skeleton)
 
 
 def _counts(batch: Batch) -> Tensor:

@@ -26,7 +26,9 @@ class Recipe:
     refiner: str | None = None
     """Train this refiner (std_ref or or_ref) on the estimates of `base`, whose weights stay as they are."""
     base: str | None = None
-    """Checkpoint that the refiner corrects."""
+    """Checkpoint that the refiner corrects, or that a network starts from."""
+    first: str | None = None
+    """Checkpoint of a hand_dense, which is the first of two_looks and stays as it is."""
 
     # Data
     dataset: str = 'synthetic'

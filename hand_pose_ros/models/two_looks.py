@@ -1,0 +1,139 @@
+"""Two looks at a hand, the second from where it is seen best; a design of ours.
+
+A hand may be turned any way in the image, and a network that sees it once spends most of what it can on that. Once it
+has told about where the joints are, the patch can be turned, moved and scaled so that every hand stands upright in the
+middle, as large as all others. The second network knows only such hands, and its pose prior is one of poses alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from numpy.typing import ArrayLike
+from torch import Tensor, nn
+
+from hand_pose_ros.errors import HandPoseError
+from hand_pose_ros.geometry import PATCH_SIZE
+from hand_pose_ros.models.dense import HandDense
+
+ZOOM = 0.95
+"""Half the width of a view, in cube units, of a hand that has the usual size: one hand in a hundred then has a joint
+that is further out than 0.86."""
+MAX_SIZE = 0.4
+"""What the first look tells of the size (a logarithm) counts up to this."""
+STEPS = 64
+"""Middle, direction and scale of a view are rounded to one of so many steps to 1. Engines differ in the last bits of
+what the first look says; rounded, they hardly ever see another pixel for it."""
+
+
+class View(NamedTuple):
+    """Where to look from: a point p in cube units is seen at turn @ (p - middle) / scale; its depth is not turned."""
+
+    middle: Tensor
+    """(B, 3)"""
+    turn: Tensor
+    """(B, 2, 2), a rotation in the plane of the patch."""
+    scale: Tensor
+    """(B,)"""
+
+    def into(self, points: Tensor) -> Tensor:
+        """Points (B, N, 3) in cube units -> as they are seen."""
+        offset = (points - self.middle[:, None]) / self.scale[:, None, None]
+        return torch.cat([offset[..., :2] @ self.turn.mT, offset[..., 2:]], dim=2)
+
+    def back(self, points: Tensor) -> Tensor:
+        """The inverse of `into`."""
+        turned = torch.cat([points[..., :2] @ self.turn, points[..., 2:]], dim=2)
+        return turned * self.scale[:, None, None] + self.middle[:, None]
+
+    def patch(self, patch: Tensor) -> Tensor:
+        """Patch (B, 1, 128, 128) -> what is seen of it; nearest neighbour, as when an image is cropped."""
+        size = PATCH_SIZE
+        line = torch.arange(size, device=patch.device, dtype=torch.float32) + (0.5 - size / 2)
+        middle = self.middle.float()
+        # In pixels of the patch. The steps are such that these sums are exact: no order of adding moves a pixel.
+        steps = ((self.turn * self.scale[:, None, None]).float() * 1024).round() / 1024
+        start = (middle[:, :2] + 1) * (size / 2)
+        across, down, start = (part[..., None, None] for part in (steps[:, 0], steps[:, 1], start))
+        # What lies outside is read from a border of background.
+        at = (line * across + line[:, None] * down + start).floor().clamp(-1, size).int() + 1
+        column, row = at.unbind(1)  # (B, 128, 128) each
+        image = F.pad(patch, (1, 1, 1, 1), value=1.0).flatten()
+        hand = torch.arange(patch.shape[0], device=patch.device, dtype=torch.int32)[:, None, None]
+        seen = image[(hand * (size + 2) + row) * (size + 2) + column].float()
+        depth = (seen - middle[:, 2, None, None]) / self.scale[:, None, None].float()
+        return torch.where(seen < 1, depth.clamp(-1, 1), 1.0)[:, None].to(patch.dtype)
+
+
+class TwoLooks(nn.Module):
+    """A `HandDense` that was trained, which stays as it is, and another one that looks where the first sees a hand.
+
+    Args:
+        joints: J.
+        root, knuckles: a hand is upright when the mean of its knuckles is above its root; these are joints.
+        width, bottleneck: of the second look, see `HandDense`.
+        first: the same of the first, where they differ. It may be much smaller: it tells where to look, and no more.
+
+    Raises:
+        HandPoseError: there are no such joints.
+    """
+
+    outputs = HandDense.outputs
+
+    def __init__(self, joints: int = 21, root: int = 0, knuckles: Sequence[int] = (5, 9, 13, 17), width: int = 32,
+                 bottleneck: int | None = None, first: dict[str, Any] | None = None) -> None:
+        super().__init__()
+        if not all(0 <= joint < joints for joint in (root, *knuckles)) or not knuckles:
+            raise HandPoseError(f'root {root} and knuckles {list(knuckles)} are not all among {joints} joints')
+        self.joints, self.root, self.knuckles = joints, root, list(knuckles)
+        self.first = HandDense(joints, **(first or {'width': width, 'bottleneck': bottleneck}))
+        self.first.requires_grad_(False).eval()
+        self.second = HandDense(joints, width, bottleneck)
+
+    def set_prior(self, mean: ArrayLike, components: ArrayLike) -> None:
+        """Start the prior of the second look from poses as it sees them: see `HandDense.set_prior`."""
+        self.second.set_prior(mean, components)
+
+    def train(self, mode: bool = True) -> TwoLooks:
+        """For the second look alone: the first does not train."""
+        super().train(mode)
+        self.first.eval()
+        return self
+
+    def view(self, patch: Tensor) -> View:
+        """Where to look from at the hand in a patch (B, 1, 128, 128); no gradient comes back from there."""
+        with torch.no_grad():
+            first = self.first.forward_full(patch)
+            return self.upright(first['joints'], first['size'])
+
+    def upright(self, joints: Tensor, size: Tensor) -> View:
+        """Where to look from at joints (B, J, 3) of a hand of this size (B,), the logarithm over the usual one."""
+        joints, size = joints.float(), size.float()
+        up = (joints[:, self.knuckles].mean(dim=1) - joints[:, self.root])[:, :2]
+        up = up - up.new_tensor([0.0, 1e-6])  # of a hand that points along the ray any direction will do, but one must
+        up = _unit(_rounded(_unit(up)))
+        sin, cos = (-up).unbind(1)
+        turn = torch.stack([torch.stack([cos, -sin], dim=1), torch.stack([sin, cos], dim=1)], dim=1)
+        return View(_rounded(joints.mean(dim=1)), turn, ZOOM * torch.exp(_rounded(size.clamp(-MAX_SIZE, MAX_SIZE))))
+
+    def forward(self, patch: Tensor) -> Tensor:
+        """(B, 1, 128, 128) in [-1, 1] -> (B, J, 3) in cube units."""
+        return self.forward_full(patch)['joints']
+
+    def forward_full(self, patch: Tensor) -> dict[str, Tensor]:
+        """(B, 1, 128, 128) in [-1, 1] -> joints, confidence, hand, side and size: see `HandDense.forward_full`."""
+        view = self.view(patch)
+        seen = self.second.forward_full(view.patch(patch).to(self.second.maps.weight.dtype))
+        return {**{name: seen[name] for name in self.outputs},
+                'joints': view.back(seen['joints'].float()), 'size': seen['size'].float() + view.scale.log()}
+
+
+def _rounded(x: Tensor) -> Tensor:
+    return (x * STEPS).round() / STEPS
+
+
+def _unit(x: Tensor) -> Tensor:
+    return x / x.square().sum(dim=1, keepdim=True).sqrt()

@@ -24,6 +24,10 @@ def test_a_network_is_scored_on_the_frames_with_a_hand(tmp_path):
     assert sum(part['joints'] for part in parts) == 21 * present
     assert sum(part['joints'] * part['mean_mm'] for part in parts) / (21 * present) == pytest.approx(
         summary['mean_mm'], abs=0.01)
+    rows = summary['frames_by_visible_joints']
+    assert [row['visible'] for row in rows] == [[0, 7], [8, 14], [15, 21]]
+    assert sum(row['frames'] for row in rows) == present
+    assert sum(row['frames'] * row['mean_mm'] for row in rows) / present == pytest.approx(summary['mean_mm'], abs=0.01)
 
 
 def test_calibration_counts_what_was_right():

@@ -24,7 +24,7 @@ _EXAMPLES = """examples:
   hand-pose bench --json speed.json --threads 1
   hand-pose bench --model my.safetensors --quick
 
-Networks have random weights unless --model gives others: speed does not depend on them. All rows of a group run in
+Networks and frames are those of the weights that ship. All rows of a group run in
 turn, round by round, so that whatever else the machine does meets them alike. floor is the larger of two times, both
 measured in the same run: the operations at the rate of a large matrix product, and the weights read once by a
 matrix-vector product. cpu_ms is the CPU time of a call in all threads; with --threads 1 it is what the call takes
@@ -42,7 +42,7 @@ def add_parser(subparsers: Any) -> None:
         description='Measure how fast this machine runs networks, refinement, every stage and whole frames.',
         formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--json', type=Path, metavar='FILE', help='write the rows there too')
-    parser.add_argument('--model', help='whole frames with these weights, by name or path (random ones)')
+    parser.add_argument('--model', help='whole frames with these weights, too, by name or path')
     parser.add_argument('--threads', type=count, metavar='N', help='threads for the networks (chosen by the cores)')
     parser.add_argument('--rounds', type=count, default=20, metavar='N',
                         help=f'rounds of {_CALLS} calls for each row (%(default)s)')
@@ -65,8 +65,8 @@ def run(args: argparse.Namespace) -> int:
     rounds = 1 if args.quick else args.rounds
     rows: dict[str, dict[str, float]] = {}
     with torch.inference_mode():
-        for architecture in ('deep_prior', 'hand_dense'):
-            rows |= _network_rows(architecture, threads, rounds, compiled=not args.quick)
+        for name in ('deep_prior', 'hand_dense'):
+            rows |= _network_rows(name, threads, rounds, compiled=not args.quick)
         rows |= _refiner_rows('or_ref', threads, rounds)
         rows |= _frame_rows(args.model, threads, rounds)
     machine = {
@@ -105,16 +105,16 @@ def summary(seconds: list[float]) -> dict[str, float]:
     return {'p50_ms': float(p50), 'p99_ms': float(p99), 'min_ms': min(seconds) * 1e3, 'calls': len(seconds)}
 
 
-def _network_rows(architecture: str, threads: int, rounds: int, compiled: bool) -> dict[str, dict[str, float]]:
+def _network_rows(name: str, threads: int, rounds: int, compiled: bool) -> dict[str, dict[str, float]]:
     """One network, one patch, over every way to run it."""
     import numpy as np
     import torch
 
-    from hand_pose_ros.models import build
+    from hand_pose_ros.models.checkpoints import load_checkpoint
     from hand_pose_ros.runtime import make_engine
     from hand_pose_ros.runtime.engine import Pipeline, TorchEngine
 
-    pipeline = Pipeline(build(architecture, bottleneck=30)).eval()
+    pipeline = Pipeline(load_checkpoint(name).network)
     patch = _patches(1)
     array = patch.numpy()
     engine = make_engine(pipeline.network, 'cpu', threads)
@@ -134,7 +134,7 @@ def _network_rows(architecture: str, threads: int, rounds: int, compiled: bool) 
             print(f'torch.compile does not work here: {str(error).splitlines()[0]}')
     calls['engine, 8 hands'] = lambda: engine.run(eight)
     rows = {**measure(calls, rounds), 'floor': _floor(pipeline, (patch,), threads)}
-    return {f'network {architecture}: {name}': row for name, row in rows.items()}
+    return {f'network {name}: {how}': row for how, row in rows.items()}
 
 
 def _references(pipeline: Pipeline, array: Any, threads: int) -> dict[str, Callable[[], Any]]:
@@ -194,26 +194,19 @@ def _frame_rows(model: str | None, threads: int, rounds: int) -> dict[str, dict[
     """From a VGA image of 16-bit integers to joints in metres, in all and by stage; a hand that is tracked."""
     from hand_pose_ros.depth import to_metres, to_units
     from hand_pose_ros.estimator import HandPoseEstimator
-    from hand_pose_ros.models import build
-    from hand_pose_ros.runtime import make_engine
-    from hand_pose_ros.runtime.finder import Finder
-    from hand_pose_ros.skeleton import HAND21
 
     depth, intrinsics = _vga_frame()
-    finder = Finder.from_pretrained(num_threads=threads)
     units = to_units(depth)
 
-    def estimator(architecture: str, refiner: str | None = None, **options: Any) -> HandPoseEstimator:
-        second = build(refiner) if refiner else None
-        engine = make_engine(build(architecture, bottleneck=30), 'cpu', threads, second)
-        return HandPoseEstimator(engine, HAND21, min_score=-1, side='right', **options)
+    def estimator(name: str, **options: Any) -> HandPoseEstimator:
+        return HandPoseEstimator.from_pretrained(name, device='cpu', num_threads=threads, side='right', min_score=-1,
+                                                 **options)
 
-    estimators = {
-        'deep_prior': estimator('deep_prior'), 'deep_prior, searching': estimator('deep_prior', tracking=False),
-        'deep_prior + or_ref x2': estimator('deep_prior', 'or_ref'), 'hand_dense': estimator('hand_dense'),
-        'hand_dense, searching': estimator('hand_dense', tracking=False, find=finder)}
+    estimators = {name: estimator(name) for name in ('deep_prior', 'deep_prior_orref', 'hand_dense')} | {
+        'deep_prior, searching': estimator('deep_prior', tracking=False, detector='nearest'),
+        'hand_dense, searching': estimator('hand_dense', tracking=False)}
     if model:
-        estimators[model] = HandPoseEstimator.from_pretrained(model, device='cpu', num_threads=threads)
+        estimators[model] = estimator(model)
     stages: dict[str, list[float]] = {}
 
     def frame(name: str) -> Callable[[], None]:

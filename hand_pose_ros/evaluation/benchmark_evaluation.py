@@ -21,6 +21,8 @@ from hand_pose_ros.synthetic import benchmark
 NEAR_MM = 20.0
 """A joint is right within this distance: what a confidence is the probability of."""
 BINS = np.linspace(0, 1, 11)
+THIRDS = 3
+"""Of the joints: frames are told apart by how many are visible."""
 
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 
@@ -29,10 +31,10 @@ def evaluate_benchmark(model: str | None = None, device: str = 'auto', frames: i
                        progress: Progress = lambda items, total: items) -> Result:
     """Joints of the frames of synthetic-test-v1 that show a hand; left hands are mirrored, so the side is given.
 
-    `info` has the errors of joints that the camera sees and of those that it does not. For networks that judge
-    themselves it also has the calibration of the confidence of joints, how often the side is
-    found (from both mirrorings of each patch), and the share of frames with and without a hand that the score lets
-    pass.
+    `info` has the errors of joints that the camera sees and of those that it does not, and the errors of frames by how
+    many of their joints it sees. For networks that judge themselves it also has the calibration of the confidence of
+    joints, how often the side is found (from both mirrorings of each patch), and the share of frames with and without a
+    hand that the score lets pass.
 
     Args:
         model: name of weights that ship, or path of a checkpoint; None takes the default.
@@ -69,9 +71,17 @@ def evaluate_benchmark(model: str | None = None, device: str = 'auto', frames: i
 def _by_visibility(joints: NDArray[np.float64], truth: NDArray[np.float64],
                    visible: NDArray[np.bool_]) -> dict[str, Any]:
     errors_mm = 1000 * np.linalg.norm(joints - truth, axis=-1)
-    return {name: {'joints': int(of.sum()), 'mean_mm': float(errors_mm[of].mean()),
-                   'median_mm': float(np.median(errors_mm[of]))}
-            for name, of in (('visible_joints', visible), ('hidden_joints', ~visible)) if of.any()}
+    seen, count = visible.sum(axis=1), visible.shape[1]
+
+    def errors(of: NDArray[np.bool_]) -> dict[str, float]:
+        return {'mean_mm': float(errors_mm[of].mean()), 'median_mm': float(np.median(errors_mm[of]))}
+
+    rows = [([least, most], (seen >= least) & (seen <= most))
+            for least, most in ((i * count // THIRDS + min(i, 1), (i + 1) * count // THIRDS) for i in range(THIRDS))]
+    return {**{name: {'joints': int(of.sum()), **errors(of)}
+               for name, of in (('visible_joints', visible), ('hidden_joints', ~visible)) if of.any()},
+            'frames_by_visible_joints': [{'visible': span, 'frames': int(of.sum()), **errors(of)}
+                                         for span, of in rows if of.any()]}
 
 
 def _self_knowledge(confidence: NDArray[np.float32], right: NDArray[np.bool_], hand: NDArray[np.float32],

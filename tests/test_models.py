@@ -362,6 +362,8 @@ def test_the_second_look_sees_every_hand_upright_in_the_middle_and_equally_large
                          for points in (joints, seen))
     torch.testing.assert_close(seen_width * size.exp(), width / 0.95, rtol=0.01, atol=0)
     torch.testing.assert_close(view.back(seen), joints, atol=1e-6, rtol=0)
+    with torch.autocast('cpu', torch.bfloat16):  # the truth of training is not rounded
+        assert torch.equal(view.into(joints), seen)
     # One that points at the camera, and one of which nothing is known, are seen somehow.
     assert all(part.isfinite().all() for part in network.upright(torch.zeros(1, 21, 3), torch.zeros(1)))
 

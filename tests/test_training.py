@@ -538,9 +538,11 @@ def test_the_second_look_learns_behind_a_first_which_stays(folder, tmp_path):
     # And on, from two looks; or with another first.
     again = tiny(folder, *wanted, f'base={last}', out=tmp_path / 'again').objective.network.state_dict()
     assert all(torch.equal(value, trained[name]) for name, value in again.items())
-    other = tiny(folder, *wanted, f'base={last}', f'first={large}', out=tmp_path / 'other').objective.network
+    other = tiny(folder, *wanted, f'base={last}', f'first={large}', 'train_prior=false', out=tmp_path / 'other')
+    other = other.objective.network
     assert torch.equal(other.first.maps.weight, base['maps.weight'])
     assert torch.equal(other.second.maps.weight, trained['second.maps.weight'])
+    assert not other.second.head.reconstruction.weight.requires_grad
 
 
 @pytest.mark.parametrize('architecture', ['hand_dense', 'two_looks'])

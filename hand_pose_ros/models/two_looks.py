@@ -42,11 +42,11 @@ class View(NamedTuple):
     def into(self, points: Tensor) -> Tensor:
         """Points (B, N, 3) in cube units -> as they are seen."""
         offset = (points - self.middle[:, None]) / self.scale[:, None, None]
-        return torch.cat([offset[..., :2] @ self.turn.mT, offset[..., 2:]], dim=2)
+        return torch.cat([_turned(offset[..., :2], self.turn), offset[..., 2:]], dim=2)
 
     def back(self, points: Tensor) -> Tensor:
         """The inverse of `into`."""
-        turned = torch.cat([points[..., :2] @ self.turn, points[..., 2:]], dim=2)
+        turned = torch.cat([_turned(points[..., :2], self.turn.mT), points[..., 2:]], dim=2)
         return turned * self.scale[:, None, None] + self.middle[:, None]
 
     def patch(self, patch: Tensor) -> Tensor:
@@ -97,6 +97,11 @@ class TwoLooks(nn.Module):
         """Start the prior of the second look from poses as it sees them: see `HandDense.set_prior`."""
         self.second.set_prior(mean, components)
 
+    @property
+    def head(self) -> nn.Module | None:
+        """The prior of the second look."""
+        return self.second.head
+
     def train(self, mode: bool = True) -> TwoLooks:
         """For the second look alone: the first does not train."""
         super().train(mode)
@@ -129,6 +134,11 @@ class TwoLooks(nn.Module):
         seen = self.second.forward_full(view.patch(patch).to(self.second.maps.weight.dtype))
         return {**{name: seen[name] for name in self.outputs},
                 'joints': view.back(seen['joints'].float()), 'size': seen['size'].float() + view.scale.log()}
+
+
+def _turned(points: Tensor, turn: Tensor) -> Tensor:
+    """Points (B, N, 2) after a turn (B, 2, 2); no matrix product, which training in half precision would round."""
+    return (points[:, :, None] * turn[:, None]).sum(dim=3)
 
 
 def _rounded(x: Tensor) -> Tensor:

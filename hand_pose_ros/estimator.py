@@ -42,7 +42,7 @@ SEARCH_EVERY = 5
 """While a hand is tracked, every so many images are worth a look at one more object: to search costs several times as
 much as to track."""
 HOPELESS = 0.1
-"""Beside a hand, an object that scores less at first sight gets no second look: it would cost the next image."""
+"""Beside a hand, an object that scores less at first sight is not read again: it would cost the next image."""
 FRAME_S = 1 / 30
 """Time between images for smoothing, where the caller does not say."""
 SIDE_MEMORY = 0.95
@@ -268,7 +268,7 @@ class HandPoseEstimator:
               hopeless: float = 0.0) -> _Reading:
         """Look into a cube, and again where its joints are: from an arm that was found first, to the hand.
 
-        What scores less than `hopeless` is not looked at again.
+        What scores less than `hopeless` is not read again.
         """
         reading = self._predict(depth, intrinsics, cube, track)
         for _ in range(READINGS - 1):

@@ -160,8 +160,10 @@ class Run:
 
     def _first_look(self, base: Checkpoint | None) -> Any:
         """The network that tells the second look where to look."""
-        named = load_checkpoint(self.recipe.first).network if self.recipe.first else None
-        first = getattr(base.network, 'first', None) if named is None and base else named
+        of: nn.Module | None = load_checkpoint(self.recipe.first).network if self.recipe.first else None
+        if of is None and base is not None and isinstance(base.network, TwoLooks):
+            of = base.network
+        first = of.first if isinstance(of, TwoLooks) else of
         if not isinstance(first, HandDense) or first.joints != len(self.skeleton):
             raise TrainingError(f'two_looks of {self.skeleton.name} need a hand_dense of these joints as the first: '
                                 '--set first=FILE')

@@ -59,8 +59,8 @@ class Recipe:
     """Budget in samples seen; None = `epochs` passes. Endless data have no passes: an epoch is then 72,757 samples,
     as many as the NYU training set has, or, with a budget, its `epochs`-th part."""
     precision: str = 'float32'
-    """'float32', or 'bfloat16' for the convolutions and matrix products of the forward and backward pass: two to four
-    times as fast, on a GPU and on a CPU that has the instructions (avx512_bf16, amx)."""
+    """'float32', or 'bfloat16' for the convolutions and matrix products of the forward and backward pass: about one and
+    a half times as fast on a CPU that has the instructions (avx512_bf16, amx)."""
     average: float = 0.0
     """Decay per step of the average of the weights that is validated and shipped; 0 = the weights themselves."""
     seed: int = 23455

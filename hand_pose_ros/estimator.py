@@ -167,13 +167,13 @@ class HandPoseEstimator:
             CheckpointError: there are no such weights, or they are damaged.
             InputError: there is no such detector.
         """
+        if detector not in ('network', 'nearest'):
+            raise InputError(f"unknown detector '{detector}': choose network or nearest")
         checkpoint = load_checkpoint(model)
         engine = make_engine(checkpoint.network, device=device, num_threads=num_threads, refiner=checkpoint.refiner)
         options.setdefault('cube_side', checkpoint.metadata['cube_side'])
-        if detector not in ('network', 'nearest'):
-            raise InputError(f"unknown detector '{detector}': choose network or nearest")
-        if detector == 'network':
-            options.setdefault('find', Finder.from_pretrained(num_threads=num_threads or default_threads()))
+        if detector == 'network' and 'find' not in options:
+            options['find'] = Finder.from_pretrained(num_threads=num_threads or default_threads())
         return cls(engine, get_skeleton(checkpoint.metadata['skeleton']), metadata=checkpoint.metadata, **options)
 
     def warm_up(self) -> None:
@@ -214,8 +214,9 @@ class HandPoseEstimator:
             usual = self.cube_side == self.metadata.get('cube_side')  # another was chosen with a hand in mind
             cube = Cube(track.center, self.cube_side * (track.scale if usual else 1))
             with self._timed('detect'):
-                alive = holds_a_hand(depth, intrinsics, cube, near=self.near, far=self.far,
-                                     max_through=1 if 'hand' in self.engine.outputs else MAX_THROUGH)
+                alive = len(hands) < self.max_hands and holds_a_hand(
+                    depth, intrinsics, cube, near=self.near, far=self.far,
+                    max_through=1 if 'hand' in self.engine.outputs else MAX_THROUGH)
             reading = self._read(depth, intrinsics, cube, track) if alive else None
             if reading is not None and reading.score >= self.min_score and not _overlaps(reading.cube, hands):
                 hands.append(self._follow(track, reading, dt))
@@ -289,7 +290,7 @@ class HandPoseEstimator:
         with self._timed('uncrop'):
             confidence, score, right = self._judge(patches, answer, cube)
             rightness = float(right[0] - right[-1])
-            shown = int(len(mirrored) == 2 and track.rightness + rightness < 0)
+            shown = int(len(mirrored) == 2 and SIDE_MEMORY * track.rightness + rightness < 0)
             coordinates = answer['joints'][shown].astype(np.float64)
             if mirrored[shown]:
                 coordinates[:, 0] *= -1

@@ -145,7 +145,7 @@ def crop(depth: NDArray[np.float32], cube: Cube, intrinsics: Intrinsics, size: i
     patch = np.empty((size, size), np.float32)
     cv2.warpAffine(depth, affine, (size, size), dst=patch, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
                    borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-    nothing = patch == 0
+    nothing = ~(patch > 0)  # NaN, too
     # Before the division, since a reading may be any float; not yet to the faces, which would round to not quite 1.
     np.clip(patch, z - 2 * half, z + 2 * half, out=patch)
     patch -= z

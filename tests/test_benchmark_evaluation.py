@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from hand_pose_ros.cli import main
 from hand_pose_ros.evaluation.benchmark_evaluation import _self_knowledge, evaluate_benchmark
 from hand_pose_ros.models import build
 from hand_pose_ros.models.checkpoints import save_checkpoint
@@ -41,3 +42,13 @@ def test_calibration_counts_what_was_right():
     assert known['side_found'] == 0.5
     # Of the hands one is sure of half of its joints, 0.95 * 0.5; the other is likely none, 0.27 * 0.98.
     assert known['hands_reported'] == 0.5 and known['no_hands_reported'] == 1.0
+
+
+def test_weights_for_other_joints_are_refused(tmp_path, capsys):
+    weights = tmp_path / 'nyu.safetensors'
+    save_checkpoint(weights, build('hand_dense', joints=14, width=4), {'skeleton': 'nyu14', 'cube_side': 0.3})
+    assert main(['evaluate', 'synthetic-test-v1', '--model', str(weights)]) == 1
+    assert 'those of hand21, not of nyu14' in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(['evaluate', 'synthetic-test-v1', '--side', 'left'])
+    assert '--side is for bags' in capsys.readouterr().err

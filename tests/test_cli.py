@@ -33,7 +33,9 @@ def test_the_list_of_verbs_is_complete(capsys):
     assert all(verb in text for verb in VERBS)
 
 
-@pytest.mark.parametrize('arguments', [[], ['no_such_verb'], ['estimate'], ['estimate', 'x', '--no-such-option']])
+@pytest.mark.parametrize('arguments', [[], ['no_such_verb'], ['--no-such-option', 'doctor'], ['estimate'],
+                                       ['train', 'modern', '--out', 'x', '--workers', '-1'],
+                                       ['estimate', 'x', '--no-such-option']])
 def test_bad_arguments_are_exit_code_2(arguments, capsys):
     with pytest.raises(SystemExit) as exit_:
         main(arguments)

@@ -132,15 +132,16 @@ def test_intrinsics_of_no_lens_are_refused(k: list[float]) -> None:
     camera.update(info(k=k))
     with pytest.raises(InputError, match=r'^/camera_info: .* no camera of 640x480 pixels'):
         camera.intrinsics(640, 480, Params())
-    given_ = Params(intrinsics_fx=1e-5, intrinsics_fy=1e-5)
+    given_ = Params(intrinsics_fx=1e-5, intrinsics_fy=1e-5, intrinsics_cx=320.0, intrinsics_cy=240.0)
     with pytest.raises(InputError, match=r'^parameters intrinsics\.\*: .* no camera of 640x480 pixels'):
         camera.intrinsics(640, 480, given_)
 
 
 def test_intrinsics_may_be_set_one_after_the_other() -> None:
     camera = Camera('/camera_info')
-    with pytest.raises(InputError, match='go together'):
-        camera.intrinsics(640, 480, Params(intrinsics_fx=500.0))
+    for some in ({'intrinsics_fx': 500.0}, {'intrinsics_fx': 500.0, 'intrinsics_fy': 510.0}):
+        with pytest.raises(InputError, match='go together: set all four'):
+            camera.intrinsics(640, 480, Params(**some))
     both = Params(intrinsics_fx=500.0, intrinsics_fy=510.0, intrinsics_cx=320.0, intrinsics_cy=240.0)
     assert camera.intrinsics(640, 480, both) == Intrinsics(500, 510, 320, 240, 640, 480)
 

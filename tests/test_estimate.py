@@ -257,3 +257,13 @@ def test_a_contact_sheet_is_read_like_text():
     sheet = contact_sheet([np.full((2, 3, 3), value, np.uint8) for value in (50, 100, 150)], columns=2)
     assert sheet.shape == (4, 6, 3)
     assert (sheet[0, 0, 0], sheet[0, 3, 0], sheet[2, 0, 0]) == (50, 100, 150)
+
+
+@pytest.mark.parametrize('kind', ['bag', 'folder', 'png'])
+def test_what_is_read_is_not_written_over(kind, bag, folder, command, capsys):
+    before = {path: path.read_bytes() for path in (bag, *folder.iterdir())}
+    output = {'bag': (bag, '--out', bag), 'folder': (folder, *INTRINSICS, '--overlay', folder),
+              'png': (folder / '8.png', *INTRINSICS, '--overlay', folder)}[kind]
+    assert command(*output) == 1
+    assert 'this is the input, which would be lost' in capsys.readouterr().err
+    assert before == {path: path.read_bytes() for path in (bag, *folder.iterdir())}

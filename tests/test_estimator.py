@@ -108,6 +108,15 @@ def test_two_hands_are_found_at_once_and_keep_their_names(sequence_of_two):
     assert all(np.linalg.norm(np.subtract(*(hand.cube.center for hand in hands))) > 0.15 for hands in images)
 
 
+def test_fewer_hands_are_followed_when_fewer_are_wanted(sequence_of_two):
+    estimator = HandPoseEstimator.from_pretrained(DEFAULT, device='cpu', max_hands=2)
+    counts = []
+    for i, frame in enumerate(sequence_of_two[:6]):
+        estimator.max_hands = 2 if i < 3 else 1
+        counts.append([hand.id for hand in estimator(frame.depth, frame.intrinsics)])
+    assert counts == [['hand_1', 'hand_2']] * 3 + [['hand_1']] * 3
+
+
 def test_a_second_hand_that_enters_is_found_soon(sequence, sequence_of_two):
     estimator = HandPoseEstimator.from_pretrained(DEFAULT, device='cpu', max_hands=2)
     images = [estimator(frame.depth, frame.intrinsics) for frame in sequence[:10] + sequence_of_two[10:]]

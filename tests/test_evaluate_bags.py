@@ -120,9 +120,14 @@ def test_truth_that_does_not_fit_is_refused(tmp_path, bag, model, result, capsys
     np.savez(tmp_path / 'nyu.npz', joints=np.zeros((FRAMES, 14, 3)))
     np.savez(tmp_path / 'late.npz', joints=result.predictions, stamps_ns=result.stamps_ns + 10**12)
     np.savez(tmp_path / 'odd.npz', wrong=np.zeros(3))
+    np.savez(tmp_path / 'stamps.npz', joints=result.predictions, stamps_ns=result.stamps_ns[:-1])
+    np.save(tmp_path / 'array.npy', np.zeros(3))
+    (tmp_path / 'array.npy').rename(tmp_path / 'array.npz')
     for source, message in (
             (tmp_path / 'few.npz', '3 labels for 12 images'), (tmp_path / 'nyu.npz', r'shape (12, 14, 3)'),
             (tmp_path / 'late.npz', 'no label is within 10 ms'), (tmp_path / 'odd.npz', 'array joints'),
+            (tmp_path / 'stamps.npz', 'stamps_ns of shape (11,) for 12 labels'),
+            (tmp_path / 'array.npz', 'array joints'),
             ('/truth/joints', 'HandJointsArray named /truth/joints'), ('truth.csv', 'no such file')):
         assert main(arguments(bag, model, '--ground-truth', source)) == 1
         assert message in capsys.readouterr().err
@@ -172,6 +177,8 @@ def test_what_is_wrong_with_a_bag_is_said(tmp_path, model, capsys):
         assert main(arguments(bag, model, *more)) == 1
         assert message in capsys.readouterr().err
     assert main(arguments(two, model, '--depth-topic', '/left/depth')) == 0
+    assert main(arguments(two, model, '--depth-topic', '/left/depth', '--out-bag', two)) == 1
+    assert 'this is the input, which would be lost' in capsys.readouterr().err
     with pytest.raises(SystemExit) as caught:
         main(['evaluate', 'bag.mcap', '--via-ros', '--out-bag', 'x.mcap'])
     assert caught.value.code == 2

@@ -64,7 +64,7 @@ def test_a_patch_is_within_minus_one_and_one_whatever_the_depth(cube, seed):
 
 
 @pytest.mark.parametrize(('reading', 'value'), [
-    (0.0, 1.0),     # no reading
+    (0.0, 1.0), (np.nan, 1.0), (-0.5, 1.0),     # no reading
     (0.8, 1.0),     # behind the back face
     (0.65, 1.0),    # on the back face
     (0.575, 0.5), (0.5, 0.0), (0.425, -0.5),

@@ -2,6 +2,7 @@
 
 import gzip
 import json
+from contextlib import suppress
 
 import cv2
 import numpy as np
@@ -216,3 +217,8 @@ def test_results_are_kept_with_all_that_belongs_to_them(tmp_path):
             Result.load(tmp_path / name)
     with pytest.raises(InputError, match=r'none\.npz: the file cannot be read'):
         Result.load(tmp_path / 'none.npz')
+    whole = (tmp_path / 'r.npz').read_bytes()
+    for at in range(0, len(whole), len(whole) // 300):  # a bit that fell over is an error or does not matter
+        (tmp_path / 'bit.npz').write_bytes(whole[:at] + bytes([whole[at] ^ 4]) + whole[at + 1:])
+        with suppress(InputError):
+            Result.load(tmp_path / 'bit.npz')

@@ -80,8 +80,10 @@ class Bag:
         """The first message of a connection, None if it has none."""
         if connection.msgcount == 0:
             return None
-        _, _, data = next(self.messages([connection]))
-        return self.deserialize(connection, data)
+        for _, _, data in self.messages([connection]):
+            return self.deserialize(connection, data)
+        raise InputError(f'{self.path}: the bag counts messages on {connection.topic} that are not there; '
+                         f'{_remedy(self.path)}')
 
     def deserialize(self, connection: Connection, data: bytes) -> Any:
         """The message as an object with the fields of its definition."""

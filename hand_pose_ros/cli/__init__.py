@@ -38,6 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         epilog='hand-pose VERB --help says more about each verb.')
     parser.add_argument('--version', action='version', version=f'hand-pose {__version__}')
     subparsers = parser.add_subparsers(dest='verb', metavar='VERB', required=True)
+    module = None
     # Only the verb that was asked for is imported: torch, matplotlib and ROS are slow to load.
     for verb, summary in VERBS.items():
         if argv and argv[0] == verb:
@@ -46,6 +47,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         else:
             subparsers.add_parser(verb, help=summary)
     args, unknown = parser.parse_known_args(argv)
+    if module is None:
+        parser.error('the verb comes first')
     if unknown:
         hint = getattr(module, 'HINT', 'see --help')
         subparsers.choices[args.verb].error(f'unrecognized arguments: {" ".join(unknown)} ({hint})')

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from hand_pose_ros.bags import DepthBag
-from hand_pose_ros.cli.arguments import count, metres, share
+from hand_pose_ros.cli.arguments import count, keep_input, metres, share
 from hand_pose_ros.cli.hand_bag import HandBag
 from hand_pose_ros.depth import depth_problem, read_png
 from hand_pose_ros.drawing import overlay
@@ -76,6 +76,8 @@ def run(args: argparse.Namespace) -> int:
         args.parser.error(f'--out {args.out}: the name must end in .npz or .mcap')
     if not args.out and not args.overlay:
         args.parser.error('say what to write: --out FILE, --overlay FOLDER, or both')
+    keep_input(args.out, args.input)
+    keep_input(args.overlay, args.input.parent if args.input.suffix.lower() == '.png' else args.input)
     with ExitStack() as stack:
         images, count = _open(args, stack)
         from hand_pose_ros.estimator import HandPoseEstimator  # imports torch: not for --help and bad arguments

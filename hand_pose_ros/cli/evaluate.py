@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
-from hand_pose_ros.cli.arguments import count, metres, share
+from hand_pose_ros.cli.arguments import count, keep_input, metres, share
 from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.evaluation import published
 from hand_pose_ros.evaluation.results import Result, write_json
@@ -88,6 +88,9 @@ def run(args: argparse.Namespace) -> int:
     if args.predictions:
         return _run_text(args)
     if args.bags == ['synthetic-test-v1']:
+        for name in ('side', 'detector', 'cube_size', 'min_score', 'ground_truth', 'via_ros', 'out_bag'):
+            if getattr(args, name) not in (None, False, 'auto', 'network'):
+                args.error(f'--{name.replace("_", "-")} is for bags: crops, sides and truth are those of the benchmark')
         from hand_pose_ros.evaluation.benchmark_evaluation import evaluate_benchmark
         result = evaluate_benchmark(args.model, args.device, progress=_progress('batches'))
         _deliver(args, result, [published.load_result(source) for source in args.compare], None)
@@ -124,6 +127,7 @@ def _run_bag(args: argparse.Namespace) -> int:
     from hand_pose_ros.cli.hand_bag import HandBag
     from hand_pose_ros.evaluation.bag_evaluation import evaluate_bag, read_depths
 
+    keep_input(args.out_bag, args.bags[0])
     settings = _settings(args)
     sink = partial(HandBag, args.out_bag) if args.out_bag else None
     result = _evaluate_live(args, settings) if args.via_ros else \
@@ -178,6 +182,8 @@ def _run_bags(args: argparse.Namespace) -> int:
         args.error('--compare and --via-ros work with one bag, not with several')
     settings, names = _settings(args), _names(args.bags)
     sinks = {bag: partial(HandBag, Path(args.out_bag) / f'{names[bag]}.mcap') for bag in args.bags if args.out_bag}
+    for bag in sinks:
+        keep_input(Path(args.out_bag) / f'{names[bag]}.mcap', bag)
     outcomes = evaluate_bags(args.bags, settings, args.jobs, _progress('bags'), sinks)
     summaries: dict[str, Any] = {}
     for bag, outcome in outcomes.items():
@@ -214,7 +220,7 @@ def _settings(args: argparse.Namespace) -> Settings:
 def _names(bags: Sequence[str]) -> dict[str, str]:
     """A short name for each bag, which no other has."""
     stems = [Path(bag).stem for bag in bags]
-    return {bag: stem if stems.count(stem) == 1 else '_'.join(Path(bag).with_suffix('').parts).strip('/\\_.')
+    return {bag: stem if stems.count(stem) == 1 else '_'.join(Path(bag).parts).strip('/\\_.')
             for bag, stem in zip(bags, stems, strict=True)}
 
 

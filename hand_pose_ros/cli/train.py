@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from hand_pose_ros.cli.arguments import count
+from hand_pose_ros.cli.arguments import count, none_or_more
 
 EPILOG = """examples:
   hand-pose train modern --out runs/modern
@@ -40,12 +40,12 @@ def add_machine_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--set', action='append', default=[], metavar='KEY=VALUE', dest='overrides',
                         help='replace a value of the recipe; may be given several times')
     parser.add_argument('--device', default='cpu', help='cpu or cuda (default: %(default)s)')
-    parser.add_argument('--workers', type=int, default=1,
+    parser.add_argument('--workers', type=none_or_more, default=1,
                         help='processes that render or decode; 0: on the device, for a GPU (default: %(default)s)')
     parser.add_argument('--threads', type=count, help='threads of the training process (default: all cores)')
     parser.add_argument('--cache', type=Path, default=Path('~/.cache/hand_pose_ros/samples').expanduser(),
                         help='where rendered and decoded samples are kept for all runs (default: %(default)s)')
-    parser.add_argument('--cache-gb', type=float, default=40,
+    parser.add_argument('--cache-gb', type=count, default=40,
                         help='delete the samples used longest ago beyond this size (default: %(default)s)')
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hand_pose_ros.bags import DepthBag
-from hand_pose_ros.cli.arguments import count, metres, share
+from hand_pose_ros.cli.arguments import count, keep_input, metres, share
 from hand_pose_ros.depth import to_units
 from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.geometry import Intrinsics
@@ -73,6 +73,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _view_bag(args: argparse.Namespace) -> int:
     failed = 0
+    keep_input(args.save, args.bag)
     with DepthBag(args.bag, args.depth_topic, None, args.intrinsics, args.depth_scale) as bag:
         from hand_pose_ros.estimator import HandPoseEstimator  # imports torch: not for --help and bad arguments
         estimator = HandPoseEstimator.from_pretrained(args.model, side=args.side, max_hands=args.max_hands,

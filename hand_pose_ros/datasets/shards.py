@@ -15,6 +15,7 @@ import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -208,7 +209,10 @@ def _make_file(shard: int, path: Path) -> None:
 
 def _limit_size(root: Path, limit: int) -> None:
     """Delete the shards that were used longest ago; whoever has one open keeps it."""
-    files = [(path.stat().st_mtime, path.stat().st_size, path) for path in root.glob('*/*.safetensors')]
+    files = []
+    for path in root.glob('*/*.safetensors'):
+        with suppress(FileNotFoundError):  # another process may make room, too
+            files.append((path.stat().st_mtime, path.stat().st_size, path))
     used = 0
     for _, size, path in sorted(files, reverse=True):
         used += size

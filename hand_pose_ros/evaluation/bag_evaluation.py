@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
+from datetime import timedelta
 from itertools import islice
 from multiprocessing import get_context
 from pathlib import Path
@@ -212,7 +213,7 @@ def _gather(done: dict[str | Path, Any], rank: int, world: int) -> dict[str | Pa
     """Everybody's results at the first process; none elsewhere."""
     import torch.distributed as dist
 
-    dist.init_process_group('gloo')
+    dist.init_process_group('gloo', timeout=timedelta(days=7))  # the others may have longer bags
     try:
         everything: list[dict[str | Path, Any]] | None = [{}] * world if rank == 0 else None
         dist.gather_object(done, everything)

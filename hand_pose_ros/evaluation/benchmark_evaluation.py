@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hand_pose_ros.datasets import joints_in_metres
+from hand_pose_ros.errors import InputError
 from hand_pose_ros.estimator import HandPoseEstimator
 from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.models.checkpoints import DEFAULT, load_checkpoint
 from hand_pose_ros.runtime import make_engine
 from hand_pose_ros.scoring import learned
-from hand_pose_ros.skeleton import get_skeleton
+from hand_pose_ros.skeleton import HAND21, get_skeleton
 from hand_pose_ros.synthetic import benchmark
 
 NEAR_MM = 20.0
@@ -39,8 +40,14 @@ def evaluate_benchmark(model: str | None = None, device: str = 'auto', frames: i
     Args:
         model: name of weights that ship, or path of a checkpoint; None takes the default.
         frames: only the first so many.
+
+    Raises:
+        InputError: the weights are for other joints.
     """
     checkpoint = load_checkpoint(model)
+    skeleton = get_skeleton(checkpoint.metadata['skeleton'])
+    if skeleton is not HAND21:
+        raise InputError(f'{model}: the joints of synthetic-test-v1 are those of hand21, not of {skeleton.name}')
     engine = make_engine(checkpoint.network, device=device, refiner=checkpoint.refiner)
     joints, truth, visible, judged = [], [], [], []
     batch_size = 50
@@ -58,7 +65,6 @@ def evaluate_benchmark(model: str | None = None, device: str = 'auto', frames: i
             mirrored = engine.run_full(np.ascontiguousarray(batch['patch'].numpy()[..., ::-1]))
             right = np.linalg.norm(predicted - expected, axis=-1) * 1000 <= NEAR_MM
             judged.append((answer['confidence'], right, answer['hand'], answer['side'] > mirrored['side'], present))
-    skeleton = get_skeleton(checkpoint.metadata['skeleton'])
     info = {'model': model or DEFAULT, 'engine': engine.name,
             **_by_visibility(np.concatenate(joints), np.concatenate(truth), np.concatenate(visible))}
     if judged:

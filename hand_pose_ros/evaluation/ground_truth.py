@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from hand_pose_ros.bags import read_hands
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.evaluation.published import read_text
-from hand_pose_ros.evaluation.results import Result
+from hand_pose_ros.evaluation.results import DAMAGE, Result
 
 TOLERANCE_NS = 10_000_000
 """A label belongs to the image with the nearest stamp, if it is not further away than this (10 ms)."""
@@ -56,9 +55,12 @@ def _read(source: str, bag: str | Path, result: Result) -> tuple[NDArray[np.int6
     if Path(source).suffix == '.npz':
         try:
             with np.load(source) as file:
-                return file.get('stamps_ns'), file['joints'].astype(np.float64)
-        except (OSError, KeyError, ValueError, BadZipFile):
+                stamps, joints = file.get('stamps_ns'), file['joints'].astype(np.float64)
+        except (OSError, *DAMAGE):
             raise InputError(f'{source}: not an .npz file with an array joints (frames, joints, 3) in metres') from None
+        if stamps is not None and stamps.shape != (len(joints),):
+            raise InputError(f'{source}: stamps_ns of shape {stamps.shape} for {len(joints)} labels: give one for each')
+        return stamps, joints
     return None, read_text(source, result.skeleton).points(result.intrinsics)
 
 

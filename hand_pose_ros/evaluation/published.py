@@ -8,6 +8,7 @@ have y up: errors are distances and do not depend on it.
 from __future__ import annotations
 
 import gzip
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -213,7 +214,7 @@ def _text(path: Path) -> str:
         return data.decode()
     except OSError as error:
         raise InputError(f'{path}: the file cannot be read ({error.strerror or error})') from None
-    except (EOFError, UnicodeDecodeError):
+    except (EOFError, UnicodeDecodeError, zlib.error):
         raise InputError(f'{path}: this is not text, or a gzip file that was cut short') from None
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import tempfile
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -22,6 +23,8 @@ from hand_pose_ros.skeleton import Skeleton
 
 FORMAT = 1
 """Raised when files of the old form can no longer be read."""
+DAMAGE = (BadZipFile, EOFError, KeyError, TypeError, ValueError, zlib.error)
+"""What reading an .npz file raises that is damaged, or of another kind."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +113,7 @@ class Result:
                     notes=tuple(meta['notes']), info=meta['info'])
         except OSError as error:
             raise InputError(f'{path}: the file cannot be read ({error.strerror or error})') from None
-        except (BadZipFile, EOFError, KeyError, TypeError, ValueError):
+        except DAMAGE:
             raise InputError(f'{path}: not a result of `hand-pose evaluate --out`, or damaged') from None
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hand_pose_ros.datasets.nyu import PALM, read_nyu_depth
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.evaluation.published import Dataset, read_text
-from hand_pose_ros.evaluation.results import Result
+from hand_pose_ros.evaluation.results import DAMAGE, Result
 from hand_pose_ros.geometry import Intrinsics
 
 Protocol = Literal['paper', 'code']
@@ -72,7 +72,7 @@ def load_tompson(predictions: str | Path, truth: str | Path, folder: str | Path,
     try:
         with np.load(predictions) as file:
             pixels = file['uv'].astype(np.float64)
-    except (OSError, KeyError, ValueError):
+    except (OSError, *DAMAGE):
         raise InputError(f'{predictions}: not an .npz file with 2D joints `uv` of shape (frames, 14, 2)') from None
     label = read_text(truth, dataset.skeleton)
     if dataset.name != 'nyu' or pixels.shape != (dataset.frames, len(dataset.skeleton), 2) \

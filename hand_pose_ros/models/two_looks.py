@@ -46,7 +46,7 @@ class View(NamedTuple):
 
     def back(self, points: Tensor) -> Tensor:
         """The inverse of `into`."""
-        turned = torch.cat([_turned(points[..., :2], self.turn.mT), points[..., 2:]], dim=2)
+        turned = torch.cat([_turned(points[..., :2], self.turn.transpose(1, 2)), points[..., 2:]], dim=2)
         return turned * self.scale[:, None, None] + self.middle[:, None]
 
     def patch(self, patch: Tensor) -> Tensor:
@@ -117,8 +117,10 @@ class TwoLooks(nn.Module):
     def upright(self, joints: Tensor, size: Tensor) -> View:
         """Where to look from at joints (B, J, 3) of a hand of this size (B,), the logarithm over the usual one."""
         joints, size = joints.float(), size.float()
-        up = (joints[:, self.knuckles].mean(dim=1) - joints[:, self.root])[:, :2]
-        up = up - up.new_tensor([0.0, 1e-6])  # of a hand that points along the ray any direction will do, but one must
+        # No constant and no index comes from a list: a copy from the host is what a CUDA graph cannot hold.
+        up = torch.stack([joints[:, k, :2] for k in self.knuckles]).mean(dim=0) - joints[:, self.root, :2]
+        # Of a hand that points along the ray any direction will do, but one must.
+        up = up - 1e-6 * torch.arange(2, device=up.device)
         up = _unit(_rounded(_unit(up)))
         sin, cos = (-up).unbind(1)
         turn = torch.stack([torch.stack([cos, -sin], dim=1), torch.stack([sin, cos], dim=1)], dim=1)

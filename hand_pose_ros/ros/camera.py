@@ -47,10 +47,10 @@ class Camera:
             InputError: there is none, it is not calibrated, it describes an image of another size, or no lens is so.
         """
         if params.has_intrinsics:
-            if not min(params.intrinsics_fx, params.intrinsics_fy) > 0:
-                raise InputError('parameters intrinsics.fx and intrinsics.fy go together: set both, or neither')
-            intrinsics = Intrinsics(params.intrinsics_fx, params.intrinsics_fy, params.intrinsics_cx,
-                                    params.intrinsics_cy, width, height)
+            given = params.intrinsics_fx, params.intrinsics_fy, params.intrinsics_cx, params.intrinsics_cy
+            if 0 in given:
+                raise InputError('parameters intrinsics.fx, .fy, .cx and .cy go together: set all four, or none')
+            intrinsics = Intrinsics(*given, width, height)
             with naming('parameters intrinsics.*'):
                 intrinsics.check_lens()
             return intrinsics

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 import os
+from collections.abc import Callable
 
 import torch
 from torch import nn
@@ -63,12 +64,16 @@ def make_engine(network: nn.Module, device: str = 'auto', num_threads: int | Non
             raise HandPoseError(f"device '{device}' was asked for, but PyTorch {torch.__version__} finds no GPU: "
                                 "use 'cpu' or 'auto', or install a PyTorch for CUDA and its driver")
         from hand_pose_ros.runtime.cuda_engine import CudaEngine
-        engine = CudaEngine(pipeline, device)
+        engine = _on(device, CudaEngine, pipeline)
     else:
-        try:
-            engine = TorchEngine(pipeline, device)
-        except (RuntimeError, AssertionError) as error:  # either, depending on what the device lacks
-            raise HandPoseError(f"device '{device}' cannot be used here ({str(error).splitlines()[0]}): "
-                                "use 'auto', 'cpu' or 'cuda'") from error
+        engine = _on(device, TorchEngine, pipeline)
     _log.info('runs on %s (%s)', engine.name, why)
     return engine
+
+
+def _on(device: str, kind: Callable[[Pipeline, str], Engine], pipeline: Pipeline) -> Engine:
+    try:
+        return kind(pipeline, device)
+    except (RuntimeError, AssertionError) as error:  # either, depending on what the device lacks
+        raise HandPoseError(f"device '{device}' cannot be used here ({str(error).splitlines()[0]}): "
+                            "use 'auto', 'cpu' or 'cuda'") from error

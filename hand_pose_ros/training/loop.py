@@ -85,10 +85,10 @@ class Run:
         keep_freed_memory()
         if machine.threads:
             torch.set_num_threads(machine.threads)
-        self._stop = self._waiting = False
+        self._stop = self._waiting = self._ending = False
         self.device = torch.device(machine.device)
-        if self.device.type == 'cuda':
-            self.device = torch.device('cuda', int(os.environ.get('LOCAL_RANK', 0)))
+        if self.device.type == 'cuda' and 'LOCAL_RANK' in os.environ:
+            self.device = torch.device('cuda', int(os.environ['LOCAL_RANK']))
 
         torch.manual_seed(recipe.seed)
         self.base = load_checkpoint(recipe.base) if recipe.base else None
@@ -144,6 +144,8 @@ class Run:
             first = self._first_look(base)
             given |= {'root': self.skeleton.root, 'knuckles': self.skeleton.knuckles,
                       'first': {'width': first.width, 'bottleneck': first.bottleneck}}
+        if taken := sorted(given.keys() & recipe.options.keys()):
+            raise TrainingError(f'--set options.{taken[0]}: this follows from the dataset; leave it out')
         network = build(recipe.network, **given, **recipe.options)
         if first is not None:
             network.first.load_state_dict(first.state_dict())  # type: ignore[union-attr]
@@ -252,7 +254,7 @@ class Run:
                     self.folder.write({'step': self.step, 'samples': done, **values,
                                        'rate': round(bar.format_dict['rate'] or 0, 1),
                                        'learning_rate': self.optimizer.param_groups[0]['lr']})
-                if self._stop and not last:
+                if self._ending and not last:
                     raise KeyboardInterrupt
                 if last or done // recipe.val_every > (done - recipe.batch_size) // recipe.val_every:
                     result = self._validate()
@@ -278,8 +280,11 @@ class Run:
         loss = torch.stack(list(terms.values())).sum()
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        if self.world > 1:
-            dist.all_reduce(loss := loss.detach())  # so that all of them stop when one has to
+        self._ending = self._stop
+        if self.world > 1:  # all of them stop when one has to, after the same step
+            shared = torch.stack([loss.detach(), loss.new_tensor(float(self._stop))])
+            dist.all_reduce(shared)
+            loss, self._ending = shared[0], bool(shared[1])
         if not torch.isfinite(loss):
             self._fail(batch, terms)
         self.optimizer.step()

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hand_pose_ros.geometry import Cube, Intrinsics
+from hand_pose_ros.hand import HandEstimate
 from hand_pose_ros.skeleton import HAND21, Skeleton
 
 Picture = NDArray[np.uint8]
@@ -28,19 +28,6 @@ _LIGHT = np.array([-0.45, -0.55, -0.70], np.float32)  # over the viewer's left s
 _NEAR_TINT = np.array([225, 238, 250], np.float32)  # BGR: near is warm and bright, far is blue and dark
 _FAR_TINT = np.array([120, 75, 55], np.float32)
 _NOTHING = (28, 24, 24)
-
-
-class Hand(Protocol):
-    """What is drawn of a hand; hand_pose_ros.estimator.HandEstimate has it."""
-
-    @property
-    def joints(self) -> NDArray[np.float32]: ...
-    @property
-    def cube(self) -> Cube: ...
-    @property
-    def side(self) -> str: ...
-    @property
-    def score(self) -> float: ...
 
 
 def shade(depth: NDArray[np.float32], intrinsics: Intrinsics, near: float | None = None,
@@ -93,7 +80,7 @@ def draw_cube(picture: Picture, cube: Cube, intrinsics: Intrinsics,
         _line(picture, start, end, color, 1)
 
 
-def overlay(depth: NDArray[np.float32], intrinsics: Intrinsics, hands: Sequence[Hand],
+def overlay(depth: NDArray[np.float32], intrinsics: Intrinsics, hands: Sequence[HandEstimate],
             skeleton: Skeleton = HAND21, height: int = 480) -> Picture:
     """The whole image with its hands, and beside it each hand alone, close up.
 
@@ -109,23 +96,22 @@ def overlay(depth: NDArray[np.float32], intrinsics: Intrinsics, hands: Sequence[
         draw_joints(picture, hand.joints, whole.intrinsics, skeleton)
     panels = [picture]
     for hand in hands:
-        panels.append(close_up(depth, intrinsics, hand, skeleton, height))
+        panels.append(close_up(depth, intrinsics, hand.cube, hand.joints, skeleton, height))
         _write(panels[-1], f'{hand.side} {hand.score:.2f}')
     if not hands:
         _write(picture, 'no hand')
     return np.hstack(panels)
 
 
-def close_up(depth: NDArray[np.float32], intrinsics: Intrinsics, hand: Hand, skeleton: Skeleton = HAND21,
-             size: int = 480) -> Picture:
-    """The cube of a hand, enlarged to size x size pixels, with its joints."""
-    half = hand.cube.side / 2
-    z = hand.cube.center[2]
-    u, v = intrinsics.project(hand.cube.center)
+def close_up(depth: NDArray[np.float32], intrinsics: Intrinsics, cube: Cube, joints: ArrayLike,
+             skeleton: Skeleton = HAND21, size: int = 480) -> Picture:
+    """What is in a cube, enlarged to size x size pixels, with joints (J, 3) in metres."""
+    half, z = cube.side / 2, cube.center[2]
+    u, v = intrinsics.project(cube.center)
     reach = (2 * half * intrinsics.fx / z, 2 * half * intrinsics.fy / z)
     view = _View(depth, intrinsics, (u - reach[0] / 2, v - reach[1] / 2), reach, (size, size))
     picture = view.shade(z - half, z + half)
-    draw_joints(picture, hand.joints, view.intrinsics, skeleton)
+    draw_joints(picture, joints, view.intrinsics, skeleton)
     return picture
 
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from hand_pose_ros.detection import MAX_THROUGH, Region, candidates, holds_a_hand
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.geometry import PATCH_SIZE, Cube, Intrinsics, crop
+from hand_pose_ros.hand import HandEstimate, Side
 from hand_pose_ros.models.checkpoints import load_checkpoint
 from hand_pose_ros.models.dense import TOLD_SIZE
 from hand_pose_ros.runtime import Engine, default_threads, make_engine
@@ -29,7 +30,7 @@ from hand_pose_ros.scoring import explain, learned
 from hand_pose_ros.skeleton import Skeleton, get_skeleton
 from hand_pose_ros.smoothing import OneEuroFilter
 
-Side = Literal['left', 'right', 'unknown']
+__all__ = ['HandEstimate', 'HandPoseEstimator', 'Side']
 
 RECENTER_M = 0.03
 """A cube whose centre is further than this from the middle of the joints it gave is moved there and read again. On
@@ -54,29 +55,6 @@ USUAL_SIZE = 0.166
 """Metres from the wrist along the bones to the tip of the middle finger, of the hand that a usual cube is for."""
 SIZE_IMAGES = 10
 """So many images of a hand make half of what it tells of its size believed: a cube that fits is seen better."""
-
-
-@dataclass(frozen=True)
-class HandEstimate:
-    """One hand in one image.
-
-    Attributes:
-        joints: (J, 3) float32, metres, optical frame of the camera.
-        joint_names: the J names, in the order of the skeleton.
-        confidence: (J,) float32 in [0, 1].
-        score: of the whole hand, in [0, 1].
-        side: 'left', 'right' or 'unknown'.
-        cube: what the network looked at.
-        id: the same from image to image as long as the hand is tracked.
-    """
-
-    joints: NDArray[np.float32]
-    joint_names: tuple[str, ...]
-    confidence: NDArray[np.float32]
-    score: float
-    side: Side
-    cube: Cube
-    id: str
 
 
 @dataclass

@@ -8,13 +8,12 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations, product
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hand_pose_ros.drawing import FINGER_COLORS
-from hand_pose_ros.geometry import Cube
+from hand_pose_ros.hand import HandEstimate
 from hand_pose_ros.skeleton import Skeleton
 
 ADD, DELETE = 0, 2
@@ -31,17 +30,6 @@ _GREY = (0.6, 0.6, 0.6, 0.6)
 _CORNERS = list(product((-0.5, 0.5), repeat=3))
 _EDGES = np.array([(a, b) for a, b in combinations(_CORNERS, 2)
                    if sum(p != q for p, q in zip(a, b, strict=True)) == 1]).reshape(-1, 3)
-
-
-class Hand(Protocol):
-    """What is shown of a hand; hand_pose_ros.estimator.HandEstimate has it."""
-
-    @property
-    def id(self) -> str: ...
-    @property
-    def joints(self) -> NDArray[np.float32]: ...
-    @property
-    def cube(self) -> Cube: ...
 
 
 @dataclass(frozen=True)
@@ -78,7 +66,7 @@ class HandMarkers:
         # A bone belongs to the finger at its far end: the one from the wrist to the thumb is the thumb's.
         self._bone_colors = tuple(self._joint_colors[child] for _, child in skeleton.bones for _ in range(2))
 
-    def update(self, hands: Sequence[Hand]) -> list[Marker]:
+    def update(self, hands: Sequence[HandEstimate]) -> list[Marker]:
         """Deletions of the hands that were there before and are not now, and markers of the hands of an image."""
         ids = {hand.id for hand in hands}
         lost, self._shown = self._shown - ids, ids
@@ -89,7 +77,7 @@ class HandMarkers:
         lost, self._shown = self._shown, set()
         return _deletions(lost)
 
-    def _show(self, hand: Hand) -> tuple[Marker, ...]:
+    def _show(self, hand: HandEstimate) -> tuple[Marker, ...]:
         joints, bones, cube = (f'{hand.id}/{part}' for part in PARTS)
         corners = np.array(hand.cube.center) + _EDGES * hand.cube.side
         return (Marker(joints, ADD, SPHERE_LIST, (JOINT_DIAMETER_M,) * 3, hand.joints, self._joint_colors),

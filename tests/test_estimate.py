@@ -241,7 +241,7 @@ def test_joints_are_drawn_where_they_are_in_the_colour_of_their_finger(drawn):
         color = FINGER_COLORS[HAND21.fingers[tip]]
         assert color_at(picture, hand.joints[tip], twice) == color
         assert color_at(picture[:, 640:], hand.joints[tip], cube) == color
-        assert color_at(close_up(depth, camera, hand), hand.joints[tip], cube) == color
+        assert color_at(close_up(depth, camera, hand.cube, hand.joints), hand.joints[tip], cube) == color
 
 
 def test_nothing_is_dark_and_near_is_brighter_than_far():

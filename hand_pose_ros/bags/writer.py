@@ -7,7 +7,7 @@ import shutil
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,29 +17,13 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from hand_pose_ros.bags.bag import CAMERA_INFO, COMPRESSED_IMAGE, HAND, HANDS, IMAGE, SIDES, SKELETON, typestore
 from hand_pose_ros.depth import encode_compressed, to_units
 from hand_pose_ros.errors import InputError
-from hand_pose_ros.geometry import Cube, Intrinsics
+from hand_pose_ros.geometry import Intrinsics
+from hand_pose_ros.hand import HandEstimate
 from hand_pose_ros.markers import Marker
 from hand_pose_ros.skeleton import HAND21, Skeleton
 
 MARKERS = 'visualization_msgs/msg/MarkerArray'
 _FOREVER = QosTime(2147483647, 4294967295)  # what rosbag2 writes for "no limit"
-
-
-class Hand(Protocol):
-    """What is written of a hand; hand_pose_ros.estimator.HandEstimate has it."""
-
-    @property
-    def id(self) -> str: ...
-    @property
-    def side(self) -> str: ...
-    @property
-    def score(self) -> float: ...
-    @property
-    def joints(self) -> NDArray[np.float32]: ...
-    @property
-    def confidence(self) -> NDArray[np.float32]: ...
-    @property
-    def cube(self) -> Cube: ...
 
 
 class BagWriter:
@@ -118,7 +102,7 @@ class BagWriter:
             self.write(f'{topic}/compressedDepth', COMPRESSED_IMAGE, self._types[COMPRESSED_IMAGE](
                 header=header, format=name, data=np.frombuffer(data, np.uint8)), stamp_ns)
 
-    def write_hands(self, stamp_ns: int, frame_id: str, hands: Sequence[Hand], skeleton: Skeleton = HAND21,
+    def write_hands(self, stamp_ns: int, frame_id: str, hands: Sequence[HandEstimate], skeleton: Skeleton = HAND21,
                     topic: str = '/hand/joints') -> None:
         """Write a HandJointsArray: all hands of one image, none included."""
         self.write(topic, HANDS, self._types[HANDS](
@@ -171,7 +155,7 @@ class BagWriter:
         x, y, z = (float(value) for value in xyz)
         return self._types['geometry_msgs/msg/Point'](x=x, y=y, z=z)
 
-    def _hand(self, hand: Hand) -> Any:
+    def _hand(self, hand: HandEstimate) -> Any:
         return self._types[HAND](
             id=hand.id, side=SIDES.index(hand.side), score=float(hand.score),
             joints=[self._point(joint) for joint in hand.joints], confidence=np.asarray(hand.confidence, np.float32),

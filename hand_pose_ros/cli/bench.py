@@ -133,7 +133,7 @@ def _network_rows(name: str, threads: int, rounds: int, compiled: bool) -> dict[
         except Exception as error:  # whatever a compiler that is missing or too old comes up with
             print(f'torch.compile does not work here: {str(error).splitlines()[0]}')
     calls['engine, 8 hands'] = lambda: engine.run(eight)
-    rows = {**measure(calls, rounds), 'floor': _floor(pipeline, (patch,), threads)}
+    rows = {**measure(calls, rounds), 'floor': _floor(pipeline, (patch,))}
     return {f'network {name}: {how}': row for how, row in rows.items()}
 
 
@@ -186,7 +186,7 @@ def _refiner_rows(architecture: str, threads: int, rounds: int) -> dict[str, dic
 
     rows = measure({'engine': lambda: engine.run(array), 'pytorch, all joints at once': lambda: plain.run(array),
                     'pytorch, joint by joint': joint_by_joint}, rounds)
-    rows['floor'] = _floor(refiner, (patch, joints), threads, reads=2)
+    rows['floor'] = _floor(refiner, (patch, joints), reads=2)
     return {f'refine {architecture} x2: {name}': row for name, row in rows.items()}
 
 
@@ -225,7 +225,7 @@ def _frame_rows(model: str | None, threads: int, rounds: int) -> dict[str, dict[
     return rows
 
 
-def _floor(module: nn.Module, inputs: tuple[Tensor, ...], threads: int, reads: int = 1) -> dict[str, float]:
+def _floor(module: nn.Module, inputs: tuple[Tensor, ...], reads: int = 1) -> dict[str, float]:
     """The least time that the operations and the weights of a module need here: a row, with both parts."""
     import torch
     from torch.utils.flop_counter import FlopCounterMode

@@ -15,11 +15,11 @@ import numpy as np
 from hand_pose_ros.bags import DepthBag, RecordedHands, read_hands
 from hand_pose_ros.drawing import Picture, contact_sheet, overlay
 from hand_pose_ros.errors import InputError
+from hand_pose_ros.hand import HandEstimate
 from hand_pose_ros.resources import resource
 from hand_pose_ros.skeleton import get_skeleton
 
 if TYPE_CHECKING:
-    from hand_pose_ros.estimator import HandEstimate
     from hand_pose_ros.ros.live import Answers
 
 TRUTH_TOPIC = '/truth/joints'

@@ -25,10 +25,11 @@ from hand_pose_ros.depth import depth_problem, read_png
 from hand_pose_ros.drawing import overlay
 from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.geometry import Intrinsics
+from hand_pose_ros.hand import HandEstimate
 from hand_pose_ros.skeleton import Skeleton
 
 if TYPE_CHECKING:
-    from hand_pose_ros.estimator import HandEstimate, HandPoseEstimator
+    from hand_pose_ros.estimator import HandPoseEstimator
 
 _EXAMPLES = """examples:
   hand-pose estimate recording.mcap --out joints.npz --overlay pictures

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from os import PathLike
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 from hand_pose_ros.bags import BagWriter
+from hand_pose_ros.hand import HandEstimate
 from hand_pose_ros.markers import HandMarkers
 from hand_pose_ros.skeleton import Skeleton
-
-if TYPE_CHECKING:
-    from hand_pose_ros.estimator import HandEstimate
 
 
 class Stamped(Protocol):

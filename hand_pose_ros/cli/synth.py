@@ -180,8 +180,8 @@ def _record(args: argparse.Namespace) -> None:
     from tqdm import tqdm
 
     from hand_pose_ros.bags import BagWriter
-    from hand_pose_ros.estimator import HandEstimate
     from hand_pose_ros.geometry import Cube
+    from hand_pose_ros.hand import HandEstimate
     from hand_pose_ros.skeleton import HAND21
 
     sequence = _hands(args, args.sensors).sequence(args.start, args.number)

@@ -17,7 +17,8 @@ from hand_pose_ros.cli.arguments import count, keep_input, metres, share
 from hand_pose_ros.depth import to_units
 from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.geometry import Intrinsics
-from hand_pose_ros.markers import DELETE, SPHERE_LIST, Hand, HandMarkers, Marker
+from hand_pose_ros.hand import HandEstimate
+from hand_pose_ros.markers import DELETE, SPHERE_LIST, HandMarkers, Marker
 from hand_pose_ros.skeleton import Skeleton
 
 if TYPE_CHECKING:
@@ -139,7 +140,7 @@ class Scene:
             principal_point=(intrinsics.cx, intrinsics.cy), camera_xyz=self._rerun.ViewCoordinates.RDF))
         self._stream.log('camera/depth', self._rerun.DepthImage(to_units(depth, 0.001), meter=1000.0))
 
-    def add_hands(self, stamp_ns: int, hands: Sequence[Hand], skeleton: Skeleton) -> None:
+    def add_hands(self, stamp_ns: int, hands: Sequence[HandEstimate], skeleton: Skeleton) -> None:
         """Show the hands of an image, and take away those that are gone."""
         self._at(stamp_ns)
         if self._markers is None:

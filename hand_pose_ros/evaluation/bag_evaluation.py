@@ -23,6 +23,7 @@ from hand_pose_ros.estimator import HandEstimate, HandPoseEstimator
 from hand_pose_ros.evaluation.ground_truth import with_truth
 from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.geometry import Intrinsics
+from hand_pose_ros.runtime import cores
 from hand_pose_ros.skeleton import Skeleton
 
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
@@ -36,7 +37,7 @@ class Sink(Protocol):
 
 
 OpenSink = Callable[[Skeleton, Mapping[str, Any]], AbstractContextManager[Sink]]
-STAGES = ('read', 'decode', 'detect', 'crop', 'predict', 'refine', 'uncrop')
+STAGES = ('read', 'decode', 'detect', 'crop', 'predict', 'uncrop')
 
 
 @dataclass(frozen=True)
@@ -124,9 +125,9 @@ def evaluate_bags(paths: Sequence[str | Path], settings: Settings, jobs: int | N
     world, rank = int(os.environ.get('WORLD_SIZE', 1)), int(os.environ.get('RANK', 0))
     here = int(os.environ.get('LOCAL_WORLD_SIZE', 1))
     mine = paths[rank::world]
-    cores = max(1, _cores() // here)
-    workers = max(1, min(jobs or cores, len(mine)))
-    settings = replace(settings, num_threads=settings.num_threads or max(1, cores // workers))
+    share = max(1, cores() // here)
+    workers = max(1, min(jobs or share, len(mine)))
+    settings = replace(settings, num_threads=settings.num_threads or max(1, share // workers))
     done: dict[str | Path, Result | HandPoseError] = {}
     # A single worker need not be another process, which would load everything again.
     with ThreadPoolExecutor(1) if workers == 1 else ProcessPoolExecutor(workers, get_context('spawn')) as pool:
@@ -220,10 +221,6 @@ def _gather(done: dict[str | Path, Any], rank: int, world: int) -> dict[str | Pa
     finally:
         dist.destroy_process_group()
     return {path: result for share in everything or [] for path, result in share.items()}
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count() or 1
 
 
 def _stage_order(stage: str) -> int:

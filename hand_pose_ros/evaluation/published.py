@@ -120,20 +120,16 @@ def read_text(path: str | Path, skeleton: Skeleton) -> Labels:
     return Labels(path, uvd, tuple(names))
 
 
-def load_published(predictions: str | Path, truth: str | Path, dataset: Dataset,
-                   intrinsics: Intrinsics | None = None) -> Result:
+def load_published(predictions: str | Path, truth: str | Path, dataset: Dataset) -> Result:
     """Predictions and labels of a dataset, matched row by row.
 
     Files with names on both sides are matched by name. Otherwise both must have the same number of rows, or one
     of them that of a single part of the dataset: it is then matched to this part, and the result has a note of it.
 
-    Args:
-        intrinsics: instead of those of the dataset.
-
     Raises:
         InputError: a file is not as `read_text` wants it, or the rows cannot be matched.
     """
-    camera = intrinsics or dataset.intrinsics
+    camera = dataset.intrinsics
     guess, label = read_text(predictions, dataset.skeleton), read_text(truth, dataset.skeleton)
     if guess.names and label.names:
         rows_p, rows_t, notes = _match_names(guess, label)
@@ -153,12 +149,11 @@ def load_published(predictions: str | Path, truth: str | Path, dataset: Dataset,
               'intrinsics': f'fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g}'})
 
 
-def load_result(source: str, truth: str | Path | None = None, dataset: Dataset | None = None,
-                intrinsics: Intrinsics | None = None) -> Result:
+def load_result(source: str, truth: str | Path | None = None, dataset: Dataset | None = None) -> Result:
     """A result by `FILE` or `NAME=FILE`: an .npz file that `Result.save` wrote, or predictions as text.
 
     Args:
-        truth, dataset, intrinsics: for text, as in `load_published`.
+        truth, dataset: for text, as in `load_published`.
 
     Raises:
         InputError: the file cannot be used, or it is text and there is no truth to it.
@@ -169,7 +164,7 @@ def load_result(source: str, truth: str | Path | None = None, dataset: Dataset |
     elif truth is None or dataset is None:
         raise InputError(f'{path}: predictions as text need --ground-truth and --dataset')
     else:
-        result = load_published(path, truth, dataset, intrinsics)
+        result = load_published(path, truth, dataset)
     return replace(result, name=name) if name else result
 
 

@@ -100,16 +100,6 @@ class _Card:
     view: dict[str, Any]
 
 
-@dataclass(frozen=True)
-class _Hand:
-    """What drawing.close_up wants of a hand."""
-
-    joints: NDArray[np.float32]
-    cube: Cube
-    side: str = 'unknown'
-    score: float = 1.0
-
-
 def _cards(result: Result, read_depths: ReadDepths | None) -> list[_Card]:
     cards: list[_Card] = []
     shown = _interesting_frames(result)
@@ -123,7 +113,7 @@ def _cards(result: Result, read_depths: ReadDepths | None) -> list[_Card]:
         depth = depths.get(row)
         picture, kind = '', 'blind'
         if depth is not None:
-            panels = [close_up(depth, result.intrinsics, _Hand(joints.astype(np.float32), cube), result.skeleton)
+            panels = [close_up(depth, result.intrinsics, cube, joints, result.skeleton)
                       for joints in (estimate, truth) if np.isfinite(joints).all()]
             kind = '' if len(panels) == 2 else 'single'
             picture = _data_image('png', cv2.imencode('.png', np.hstack(panels))[1].tobytes(),

@@ -15,7 +15,7 @@ from hand_pose_ros.runtime.engine import Engine, Pipeline, TorchEngine
 from hand_pose_ros.runtime.lanes import fill_lanes
 from hand_pose_ros.runtime.onnx_engine import OnnxEngine
 
-__all__ = ['Engine', 'default_threads', 'make_engine']
+__all__ = ['Engine', 'cores', 'default_threads', 'make_engine']
 
 NO_JOINTS = ('hand_finder', 'center_refiner', 'std_ref', 'or_ref')
 """Networks that are parts of something, or find hands."""
@@ -23,10 +23,14 @@ NO_JOINTS = ('hand_finder', 'center_refiner', 'std_ref', 'or_ref')
 _log = logging.getLogger(__name__)
 
 
+def cores() -> int:
+    """Those that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count() or 1
+
+
 def default_threads() -> int:
     """Threads for one network on this machine: at most 4, more do not help networks this small; the rest is ROS's."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count() or 1
-    return min(4, cores if cores <= 2 else cores - 1)
+    return min(4, cores() if cores() <= 2 else cores() - 1)
 
 
 def make_engine(network: nn.Module, device: str = 'auto', num_threads: int | None = None,

@@ -12,14 +12,13 @@ from hand_pose_ros.datasets.shards import DiskShards, MemoryShards
 
 
 def first_samples(shards: DiskShards | MemoryShards, count: int) -> list[Batch]:
-    """The first `count` samples, or all where there are fewer, shard by shard; closes the shards."""
+    """The first `count` samples, or all where there are fewer, shard by shard."""
     size = shards.dataset.size
     count = count if size is None else min(count, size)
     numbers = range(-(-count // shards.shard_size))
     shards.keep(numbers)
     batches = [shards.read(number) for number in numbers]
     batches[-1] = {key: value[:count - numbers[-1] * shards.shard_size] for key, value in batches[-1].items()}
-    shards.close()
     return batches
 
 

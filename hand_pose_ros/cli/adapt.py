@@ -9,7 +9,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hand_pose_ros.cli.arguments import count, metres
+from hand_pose_ros.cli.arguments import add_bag, bag_options, count
 from hand_pose_ros.errors import HandPoseError
 
 if TYPE_CHECKING:
@@ -51,11 +51,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('--steps', type=count, default=300, metavar='N', help='of training, 32 samples each (300)')
     parser.add_argument('--ground-truth', metavar='G', help='only for the comparison: a topic of the bag with '
                         'HandJointsArray, or an .npz file as for `hand-pose evaluate`')
-    parser.add_argument('--intrinsics', nargs=4, type=float, metavar=('FX', 'FY', 'CX', 'CY'),
-                        help='of the camera in pixels; needed for bags without camera_info')
-    parser.add_argument('--depth-scale', type=metres, metavar='M', help='metres per depth unit (0.001)')
-    parser.add_argument('--depth-topic', metavar='TOPIC', help='needed if several topics carry depth')
-    parser.add_argument('--camera-info-topic', metavar='TOPIC', help='if not camera_info beside the depth topic')
+    add_bag(parser)
     parser.set_defaults(parser=parser)
 
 
@@ -81,11 +77,8 @@ def run(args: argparse.Namespace) -> int:
     checkpoint = load_checkpoint(args.model)
     name = args.model or DEFAULT
     _check_fits(checkpoint, name)
-    bag = {'depth_topic': args.depth_topic, 'camera_info_topic': args.camera_info_topic,
-           'intrinsics': args.intrinsics and tuple(args.intrinsics), 'depth_scale': args.depth_scale}
-
     def evaluate(model: str | None, network: torch.nn.Module, what: str) -> tuple[Look, Engine, Numbers]:
-        found = look(args.bag, Settings(model, 'cpu', estimator={'side': args.side}, bag=bag,
+        found = look(args.bag, Settings(model, 'cpu', estimator={'side': args.side}, bag=bag_options(args),
                                         ground_truth=args.ground_truth), _progress(f'{what}: images'))
         engine = make_engine(network, 'cpu')
         return found, engine, judge(found, engine, _progress(f'{what}: comparison'))

@@ -1,9 +1,10 @@
-"""Kinds of values on the command line, refused with one sentence where they cannot be."""
+"""What several verbs take on the command line, and kinds of values, refused with one sentence where they cannot be."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from hand_pose_ros.errors import HandPoseError
 
@@ -44,3 +45,35 @@ def keep_input(output: str | Path | None, source: str | Path) -> None:
     """Raise HandPoseError if an output would replace the input."""
     if output is not None and Path(output).exists() and Path(source).exists() and Path(output).samefile(source):
         raise HandPoseError(f'{output}: this is the input, which would be lost: choose another place')
+
+
+def add_bag(parser: Any) -> None:
+    """How depth is read from a bag."""
+    parser.add_argument('--depth-topic', metavar='TOPIC', help='needed if several topics carry depth')
+    parser.add_argument('--camera-info-topic', metavar='TOPIC', help='if not camera_info beside the depth topic')
+    parser.add_argument('--intrinsics', nargs=4, type=float, metavar=('FX', 'FY', 'CX', 'CY'),
+                        help='of the camera in pixels, instead of those of camera_info (or of the dataset)')
+    parser.add_argument('--depth-scale', type=metres, metavar='M', help='metres per unit of 16-bit depth (0.001)')
+
+
+def bag_options(args: argparse.Namespace) -> dict[str, Any]:
+    """For `DepthBag`."""
+    return {'depth_topic': args.depth_topic, 'camera_info_topic': args.camera_info_topic,
+            'intrinsics': args.intrinsics and tuple(args.intrinsics), 'depth_scale': args.depth_scale}
+
+
+def add_estimator(parser: Any) -> None:
+    """How hands are estimated."""
+    parser.add_argument('--model', help='name of weights that ship, or a checkpoint (the default weights)')
+    parser.add_argument('--device', default='auto', help='auto, cpu, cuda or cuda:N (auto)')
+    parser.add_argument('--side', default='auto', choices=('auto', 'left', 'right'), help='which hand it is (auto)')
+    parser.add_argument('--detector', default='network', choices=('network', 'nearest'),
+                        help='how hands are found: by a network, or as what is nearest to the camera (network)')
+    parser.add_argument('--cube-size', type=metres, metavar='M', help='side of the cube around a hand, metres')
+    parser.add_argument('--min-score', type=share, metavar='S', help='leave out hands below this score (0.4)')
+
+
+def estimator_options(args: argparse.Namespace) -> dict[str, Any]:
+    """For `HandPoseEstimator.from_pretrained`, but for model and device."""
+    given = {'side': args.side, 'detector': args.detector, 'cube_side': args.cube_size, 'min_score': args.min_score}
+    return {name: value for name, value in given.items() if value is not None}

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from hand_pose_ros.bags import DepthBag
-from hand_pose_ros.cli.arguments import count, keep_input, metres, share
+from hand_pose_ros.cli.arguments import add_bag, add_estimator, bag_options, count, estimator_options, keep_input
 from hand_pose_ros.cli.hand_bag import HandBag
 from hand_pose_ros.depth import depth_problem, read_png
 from hand_pose_ros.drawing import overlay
@@ -52,20 +52,9 @@ def add_parser(subparsers: Any) -> None:
         epilog=_EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('input', metavar='INPUT', type=Path, help='a bag (ROS 1, sqlite3, MCAP), a 16-bit depth PNG, '
                         'or a folder of them')
-    parser.add_argument('--intrinsics', nargs=4, type=float, metavar=('FX', 'FY', 'CX', 'CY'),
-                        help='of the camera in pixels; needed for PNGs and for bags without camera_info')
-    parser.add_argument('--depth-scale', type=metres, default=0.001, metavar='M', help='metres per depth unit (0.001)')
-    parser.add_argument('--depth-topic', metavar='TOPIC', help='which of several depth topics of a bag')
-    parser.add_argument('--camera-info-topic', metavar='TOPIC', help='if not camera_info beside the depth topic')
-    parser.add_argument('--model', help='name of weights that ship, or a checkpoint (the default weights)')
-    parser.add_argument('--device', default='auto', help='auto, cpu, cuda or cuda:N (auto)')
-    parser.add_argument('--side', default='auto', choices=('auto', 'left', 'right'), help='which hand it is (auto)')
-    parser.add_argument('--detector', default='network', choices=('network', 'nearest'),
-                        help='how hands are found: by a network, or as what is nearest to the camera (network)')
-    parser.add_argument('--cube-size', type=metres, metavar='M', help='side of the cube around a hand, metres')
+    add_bag(parser)
+    add_estimator(parser)
     parser.add_argument('--max-hands', type=count, default=2, metavar='N', help='at most N hands per image (2)')
-    parser.add_argument('--min-score', type=share, default=0.4, metavar='S',
-                        help='leave out hands below this score (0.4)')
     parser.add_argument('--out', type=Path, metavar='FILE', help='.npz or .mcap')
     parser.add_argument('--overlay', type=Path, metavar='FOLDER', help='a picture of every image with its joints')
     parser.set_defaults(parser=parser)
@@ -82,10 +71,8 @@ def run(args: argparse.Namespace) -> int:
     with ExitStack() as stack:
         images, count = _open(args, stack)
         from hand_pose_ros.estimator import HandPoseEstimator  # imports torch: not for --help and bad arguments
-        options = {} if args.cube_size is None else {'cube_side': args.cube_size}
-        estimator = HandPoseEstimator.from_pretrained(
-            args.model, device=args.device, detector=args.detector, side=args.side, max_hands=args.max_hands,
-            min_score=args.min_score, **options)
+        estimator = HandPoseEstimator.from_pretrained(args.model, device=args.device, max_hands=args.max_hands,
+                                                      **estimator_options(args))
         sinks: list[_Sink] = []
         if args.overlay:
             sinks.append(_Overlays(args.overlay, estimator.skeleton))
@@ -157,9 +144,8 @@ def _open(args: argparse.Namespace, stack: ExitStack) -> tuple[Iterator[DepthInp
     if paths:
         if args.intrinsics is None:
             args.parser.error('PNGs come without a camera: give --intrinsics FX FY CX CY')
-        return _from_pngs(paths, args.intrinsics, args.depth_scale), len(paths)
-    bag = stack.enter_context(DepthBag(
-        args.input, args.depth_topic, args.camera_info_topic, args.intrinsics, args.depth_scale))
+        return _from_pngs(paths, args.intrinsics, args.depth_scale or 0.001), len(paths)
+    bag = stack.enter_context(DepthBag(args.input, **bag_options(args)))
     return _from_bag(bag), len(bag)
 
 

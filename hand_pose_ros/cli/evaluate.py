@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
-from hand_pose_ros.cli.arguments import count, keep_input, metres, share
+from hand_pose_ros.cli.arguments import add_bag, add_estimator, bag_options, count, estimator_options, keep_input
 from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.evaluation import published
 from hand_pose_ros.evaluation.results import Result, write_json
@@ -53,8 +53,6 @@ def add_parser(subparsers: Any) -> None:
                         'several bags a folder')
     parser.add_argument('--compare', nargs='+', default=[], metavar='[NAME=]FILE',
                         help='other results for the report: .npz of --out, or text of the same dataset')
-    parser.add_argument('--intrinsics', nargs=4, type=float, metavar=('FX', 'FY', 'CX', 'CY'),
-                        help='pixels, instead of those of the dataset or of camera_info')
     text = parser.add_argument_group('predictions as text')
     text.add_argument('--predictions', metavar='P', help='text file; or an .npz file with 2D joints `uv` of NYU, which '
                       'are lifted with --depth-folder')
@@ -64,16 +62,8 @@ def add_parser(subparsers: Any) -> None:
                       help='2D joints beside the hand get the depth of the back face of the cube (paper, the default), '
                       'or their true depth (the code of the paper, which favours them)')
     bags = parser.add_argument_group('bags')
-    bags.add_argument('--model', help='name of weights that ship, or a checkpoint')
-    bags.add_argument('--device', default='auto', help='auto (default), cpu, cuda or cuda:N')
-    bags.add_argument('--side', choices=('auto', 'left', 'right'), default='auto', help='which hand it is')
-    bags.add_argument('--detector', choices=('network', 'nearest'), default='network',
-                      help='how hands are found: by a network (default), or as what is nearest to the camera')
-    bags.add_argument('--cube-size', type=metres, metavar='M', help='side of the cube in metres')
-    bags.add_argument('--min-score', type=share, metavar='S', help='hands with a lower score are not counted as found')
-    bags.add_argument('--depth-topic', metavar='TOPIC', help='needed if several topics carry depth')
-    bags.add_argument('--camera-info-topic', metavar='TOPIC', help='if it is not beside the depth topic')
-    bags.add_argument('--depth-scale', type=metres, metavar='M', help='metres per unit of 16-bit depth (0.001)')
+    add_bag(bags)
+    add_estimator(bags)
     bags.add_argument('--out-bag', metavar='BAG', help='write /hand/joints and /hand/markers there, to be played '
                       'beside the original; with several bags a folder')
     bags.add_argument('--via-ros', action='store_true', help='play the bag through the live node at its pace, and '
@@ -209,12 +199,8 @@ def _run_bags(args: argparse.Namespace) -> int:
 def _settings(args: argparse.Namespace) -> Settings:
     from hand_pose_ros.evaluation.bag_evaluation import Settings
 
-    given = {'depth_topic': args.depth_topic, 'camera_info_topic': args.camera_info_topic,
-             'intrinsics': args.intrinsics and tuple(args.intrinsics), 'depth_scale': args.depth_scale}
-    estimator = {'side': args.side, 'detector': args.detector, 'cube_side': args.cube_size, 'min_score': args.min_score}
-    return Settings(args.model, args.device, ground_truth=args.ground_truth,
-                    bag={key: value for key, value in given.items() if value is not None},
-                    estimator={key: value for key, value in estimator.items() if value is not None})
+    return Settings(args.model, args.device, ground_truth=args.ground_truth, bag=bag_options(args),
+                    estimator=estimator_options(args))
 
 
 def _names(bags: Sequence[str]) -> dict[str, str]:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hand_pose_ros.bags import DepthBag
-from hand_pose_ros.cli.arguments import count, keep_input, metres, share
+from hand_pose_ros.cli.arguments import add_bag, add_estimator, bag_options, count, estimator_options, keep_input
 from hand_pose_ros.depth import to_units
 from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.geometry import Intrinsics
@@ -42,15 +42,10 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('bag', metavar='BAG', type=Path, nargs='?', help='a .bag, .mcap or .db3 file, or a ROS 2 '
                         'folder: its hands are estimated; without it, live topics are shown')
     parser.add_argument('--save', metavar='FILE', type=Path, help='write an .rrd file instead of opening the viewer')
-    parser.add_argument('--depth-scale', type=metres, default=0.001, metavar='M', help='metres per depth unit (0.001)')
     bag = parser.add_argument_group('with a bag')
-    bag.add_argument('--depth-topic', metavar='TOPIC', help='which of several depth topics')
-    bag.add_argument('--intrinsics', nargs=4, type=float, metavar=('FX', 'FY', 'CX', 'CY'),
-                     help='of the camera in pixels; for bags without camera_info')
-    bag.add_argument('--model', help='name of weights that ship, or a checkpoint (the default weights)')
-    bag.add_argument('--side', default='auto', choices=('auto', 'left', 'right'), help='which hand it is (auto)')
+    add_bag(bag)
+    add_estimator(bag)
     bag.add_argument('--max-hands', type=count, default=2, metavar='N', help='at most N hands per image (2)')
-    bag.add_argument('--min-score', type=share, default=0.4, metavar='S', help='leave out hands below it (0.4)')
     live = parser.add_argument_group('live')
     live.add_argument('--transport', default='raw', choices=('raw', 'compressedDepth', 'compressed'),
                       help='of the depth images (raw)')
@@ -68,17 +63,17 @@ def run(args: argparse.Namespace) -> int:
         return _view_bag(args)
     from hand_pose_ros.ros.watch import watch  # says what is missing where there is no ROS
     with Scene(args.save) as scene:
-        watch(scene.add_depth, scene.add_hands, args.transport, args.depth_scale, args.ros_args)
+        watch(scene.add_depth, scene.add_hands, args.transport, args.depth_scale or 0.001, args.ros_args)
     return 0
 
 
 def _view_bag(args: argparse.Namespace) -> int:
     failed = 0
     keep_input(args.save, args.bag)
-    with DepthBag(args.bag, args.depth_topic, None, args.intrinsics, args.depth_scale) as bag:
+    with DepthBag(args.bag, **bag_options(args)) as bag:
         from hand_pose_ros.estimator import HandPoseEstimator  # imports torch: not for --help and bad arguments
-        estimator = HandPoseEstimator.from_pretrained(args.model, side=args.side, max_hands=args.max_hands,
-                                                      min_score=args.min_score)
+        estimator = HandPoseEstimator.from_pretrained(args.model, device=args.device, max_hands=args.max_hands,
+                                                      **estimator_options(args))
         with Scene(args.save) as scene:
             for frame in bag:
                 try:

@@ -27,6 +27,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from hand_pose_ros.files import write_json
 from hand_pose_ros.resources import resource
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 570.0
@@ -65,9 +66,7 @@ def main() -> int:
         print(f'{next(reversed(rows)):<40}{row["published"]:>6}{row["lost"]:>6}{row["p50_ms"]:>9.2f}'
               f'{row["p99_ms"]:>9.2f}  {row["node"]}', flush=True)
     if args.json:
-        part = args.json.with_suffix('.part')
-        part.write_text(json.dumps(rows, indent=2) + '\n')
-        os.replace(part, args.json)
+        write_json(args.json, rows)
     return 0
 
 

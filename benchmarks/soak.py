@@ -12,7 +12,6 @@ images or cycles, to the end.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import signal
 import subprocess
@@ -31,6 +30,7 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, Image
 from tqdm import tqdm
 
+from hand_pose_ros.files import write_json
 from hand_pose_ros.msg import HandJointsArray
 from hand_pose_ros.ros import qos
 from hand_pose_ros.ros.conversions import stamp_ns
@@ -208,9 +208,7 @@ def main() -> int:
         rig.close()
         rclpy.try_shutdown()
     if args.json:
-        part = args.json.with_suffix('.part')
-        part.write_text(json.dumps(result, indent=2) + '\n')
-        os.replace(part, args.json)
+        write_json(args.json, result)
     return 0
 
 

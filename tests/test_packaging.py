@@ -109,7 +109,7 @@ def test_import_is_light() -> None:
 # ----------------------------------------------------------------------------------------------------------- the doors
 
 ROS = re.compile(r'(rclpy|tf2_\w+|launch\w*|ament_index_python|\w+_msgs|\w+_interfaces|std_srvs|hand_pose_ros\.msg)\b')
-INNER = {'geometry', 'depth', 'detection', 'estimator', 'hand', 'models', 'runtime', 'skeleton'}
+INNER = {'geometry', 'depth', 'detection', 'estimator', 'files', 'hand', 'models', 'runtime', 'skeleton'}
 OUTER = re.compile(r'hand_pose_ros\.(training|evaluation|cli|ros)\b')
 
 

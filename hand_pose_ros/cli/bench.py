@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import platform
 import time
@@ -56,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     import torch
 
     from hand_pose_ros import __version__
-    from hand_pose_ros.evaluation.results import write_atomically
+    from hand_pose_ros.files import write_json
     from hand_pose_ros.runtime import default_threads
 
     threads = args.threads or default_threads()
@@ -75,8 +74,7 @@ def run(args: argparse.Namespace) -> int:
     print(', '.join(f'{key} {value}' for key, value in machine.items()))
     print(_table(rows))
     if args.json:
-        result = json.dumps({'machine': machine, 'rows': rows}, indent=2).encode()
-        write_atomically(args.json, lambda file: file.write(result))
+        write_json(args.json, {'machine': machine, 'rows': rows})
     return 0
 
 

@@ -13,7 +13,8 @@ from hand_pose_ros.cli.evaluate import print_summaries
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.evaluation import metrics
 from hand_pose_ros.evaluation.published import DATASETS, load_result
-from hand_pose_ros.evaluation.results import Result, write_json
+from hand_pose_ros.evaluation.results import Result
+from hand_pose_ros.files import write_json
 
 EXAMPLES = """examples:
   hand-pose compare a.npz b.npz --out plots
@@ -69,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
         differences.append({'result': other.name, 'minus': first.name, 'mean_mm': difference,
                             'interval_mm': [low, high]})
     if args.json:
-        write_json({'results': summaries, 'differences': differences}, args.json)
+        write_json(args.json, {'results': summaries, 'differences': differences})
     if args.out:
         from hand_pose_ros.evaluation.report import write_report
         if any(result.skeleton != first.skeleton for result in results):

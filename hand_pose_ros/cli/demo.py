@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +13,7 @@ import numpy as np
 from hand_pose_ros.bags import DepthBag, RecordedHands, read_hands
 from hand_pose_ros.drawing import Picture, contact_sheet, overlay
 from hand_pose_ros.errors import InputError
+from hand_pose_ros.files import in_one_step, write_bytes, write_json
 from hand_pose_ros.hand import HandEstimate
 from hand_pose_ros.resources import resource
 from hand_pose_ros.skeleton import get_skeleton
@@ -67,9 +66,10 @@ def run(args: argparse.Namespace) -> int:
     summary = summarise([frame.stamp_ns for frame in frames], answers, hands, _truth(path))
     args.out.mkdir(parents=True, exist_ok=True)
     chosen = np.linspace(0, len(pictures) - 1, min(SHEET_PICTURES, len(pictures))).round().astype(int)
-    _write(args.out / 'sheet.png', cv2.imencode('.png', contact_sheet([pictures[i] for i in chosen], 3))[1].tobytes())
+    sheet = contact_sheet([pictures[i] for i in chosen], 3)
+    write_bytes(args.out / 'sheet.png', cv2.imencode('.png', sheet)[1].tobytes())
     _animate(args.out / 'animation.webp', pictures, [frame.stamp_ns for frame in frames])
-    _write(args.out / 'summary.json', json.dumps(summary, indent=2).encode() + b'\n')
+    write_json(args.out / 'summary.json', summary)
     for name, value in summary.items():
         print(f'  {name.replace("_", " "):<22}{value if isinstance(value, int) or value is None else f"{value:.1f}"}')
     print('latency: from an image to its joints at a listener beside the node; with transport and decoding (PNG in the '
@@ -117,13 +117,6 @@ def _animate(path: Path, pictures: Sequence[Picture], stamps: Sequence[int]) -> 
                                                  width - picture.shape[1], cv2.BORDER_CONSTANT))
               for picture in pictures]
     period_ms = round((stamps[-1] - stamps[0]) / max(len(stamps) - 1, 1) / 1e6)
-    part = path.with_name(f'.{path.name}')
-    images[0].save(part, format='WEBP', save_all=True, append_images=images[1:], duration=max(period_ms, 10), loop=0,
-                   quality=60, method=0)
-    os.replace(part, path)
-
-
-def _write(path: Path, data: bytes) -> None:
-    part = path.with_name(f'.{path.name}')
-    part.write_bytes(data)
-    os.replace(part, path)
+    with in_one_step(path) as part:
+        images[0].save(part, format='WEBP', save_all=True, append_images=images[1:], duration=max(period_ms, 10),
+                       loop=0, quality=60, method=0)

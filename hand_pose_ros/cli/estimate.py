@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import re
 import sys
 import time
@@ -24,6 +23,7 @@ from hand_pose_ros.cli.hand_bag import HandBag
 from hand_pose_ros.depth import depth_problem, read_png
 from hand_pose_ros.drawing import overlay
 from hand_pose_ros.errors import HandPoseError, InputError
+from hand_pose_ros.files import in_one_step
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.hand import HandEstimate
 from hand_pose_ros.skeleton import Skeleton
@@ -210,9 +210,7 @@ class _Arrays:
 
     def finish(self) -> None:
         hands, joints = [hand for _, hand in self._hands], len(self._skeleton)
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        part = self._path.with_name(f'.{self._path.name}.part')
-        with part.open('wb') as file:
+        with in_one_step(self._path) as part, part.open('wb') as file:
             np.savez_compressed(
                 file,
                 names=np.array([image.name for image in self._images]),
@@ -227,7 +225,6 @@ class _Arrays:
                 cube_side=np.array([hand.cube.side for hand in hands], np.float32),
                 joint_names=np.array(self._skeleton.joint_names),
                 skeleton=np.array(self._skeleton.name))
-        os.replace(part, self._path)
 
 
 class _Messages:

@@ -16,8 +16,9 @@ from tqdm import tqdm
 from hand_pose_ros.cli.arguments import add_bag, add_estimator, bag_options, count, estimator_options, keep_input
 from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.evaluation import published
-from hand_pose_ros.evaluation.results import Result, write_json
+from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.evaluation.tables import ACCURACY_COLUMNS, accuracy_rows, number, text_table
+from hand_pose_ros.files import write_json
 
 if TYPE_CHECKING:
     from hand_pose_ros.evaluation.bag_evaluation import Settings
@@ -189,7 +190,7 @@ def _run_bags(args: argparse.Namespace) -> int:
             out=args.out and Path(args.out) / f'{result.name}.npz')
         _deliver(single, result, [], lambda rows, bag=bag: read_depths(bag, rows, settings))  # type: ignore[misc]
     if args.json and outcomes:
-        write_json({'bags': summaries}, args.json)
+        write_json(args.json, {'bags': summaries})
     failed = [bag for bag, summary in summaries.items() if 'error' in summary or summary['damaged']]
     if failed:
         print(f'\n{len(failed)} of {len(summaries)} bags failed or are damaged: {", ".join(failed)}', file=sys.stderr)
@@ -218,7 +219,7 @@ def _deliver(args: argparse.Namespace, result: Result, others: Sequence[Result],
     summary = result.summary()
     print_summaries([(result.name, summary), *((other.name, other.summary()) for other in others)])
     if args.json:
-        write_json(summary, args.json)
+        write_json(args.json, summary)
     if args.out:
         result.save(args.out)
     if args.report:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -161,6 +160,8 @@ def _write(args: argparse.Namespace) -> None:
     import numpy as np
     from tqdm import tqdm
 
+    from hand_pose_ros.files import in_one_step
+
     hands = _hands(args, args.sensors, device=args.device)
     args.out.mkdir(parents=True, exist_ok=True)
     for indices in tqdm(list(_indices(args.start, args.number, args.shard)), unit='shard'):
@@ -168,10 +169,8 @@ def _write(args: argparse.Namespace) -> None:
         arrays['index'] = indices.numpy()
         arrays['patch'] = arrays['patch'].astype(np.float16)  # exact to 0.1 mm
         path = args.out / f'{args.split}_{int(indices[0]):09d}.npz'
-        unfinished = path.with_suffix('.part')
-        with open(unfinished, 'wb') as file:
+        with in_one_step(path) as part, part.open('wb') as file:
             np.savez_compressed(file, **arrays)
-        os.replace(unfinished, path)
 
 
 def _record(args: argparse.Namespace) -> None:

@@ -14,7 +14,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hand_pose_ros.evaluation import metrics
-from hand_pose_ros.evaluation.results import Result, write_atomically
+from hand_pose_ros.evaluation.results import Result
+from hand_pose_ros.files import write_bytes
 
 # Okabe & Ito (2008): told apart with any colour vision, and in grey by their order of lightness.
 COLORS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9', '#000000', '#B8A800')
@@ -115,8 +116,7 @@ def to_bytes(figure: Figure, form: str) -> bytes:
 def save(figure: Figure, path: str | Path) -> None:
     """Write `path`.png and `path`.svg."""
     for form in ('png', 'svg'):
-        data = to_bytes(figure, form)
-        write_atomically(Path(f'{path}.{form}'), lambda file, data=data: file.write(data))  # type: ignore[misc]
+        write_bytes(f'{path}.{form}', to_bytes(figure, form))
 
 
 def _figure(width: float, height: float, columns: int = 1) -> tuple[Figure, NDArray[np.object_]]:

@@ -21,8 +21,9 @@ from hand_pose_ros import __version__
 from hand_pose_ros.drawing import FINGER_COLORS, close_up
 from hand_pose_ros.evaluation import metrics, plots
 from hand_pose_ros.evaluation.published import DATASETS
-from hand_pose_ros.evaluation.results import Result, write_atomically
+from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.evaluation.tables import ACCURACY_COLUMNS, accuracy_rows, number
+from hand_pose_ros.files import write_bytes
 from hand_pose_ros.geometry import Cube, Intrinsics
 from hand_pose_ros.skeleton import FINGERS
 
@@ -88,7 +89,7 @@ def write_report(results: Sequence[Result], folder: str | Path, read_depths: Rea
             'colors': ['rgb({},{},{})'.format(*FINGER_COLORS[finger]) for finger in result.skeleton.fingers]}),
         subtitle=f'{summary["frames_total"]} frames, {result.skeleton.name}, hand_pose_ros {__version__}')
     path = folder / 'report.html'
-    write_atomically(path, lambda file: file.write(html.encode()))
+    write_bytes(path, html.encode())
     return path
 
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -18,6 +16,7 @@ from numpy.typing import NDArray
 from hand_pose_ros import __version__
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.evaluation import metrics
+from hand_pose_ros.files import in_one_step
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.skeleton import Skeleton
 
@@ -89,7 +88,8 @@ class Result:
         optional = {'truth': self.truth, 'stamps_ns': self.stamps_ns}
         arrays |= {key: value for key, value in optional.items() if value is not None}
         arrays |= {f'seconds_{k}': seconds for k, seconds in enumerate(self.seconds.values())}
-        write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
+        with in_one_step(path) as part, part.open('wb') as file:
+            np.savez_compressed(file, **arrays)
 
     @classmethod
     def load(cls, path: str | Path) -> Result:
@@ -115,31 +115,3 @@ class Result:
             raise InputError(f'{path}: the file cannot be read ({error.strerror or error})') from None
         except DAMAGE:
             raise InputError(f'{path}: not a result of `hand-pose evaluate --out`, or damaged') from None
-
-
-def write_json(value: Any, path: str | Path) -> None:
-    """Write strict JSON (no NaN) atomically."""
-    text = json.dumps(value, indent=2, allow_nan=False) + '\n'
-    write_atomically(path, lambda file: file.write(text.encode()))
-
-
-def write_atomically(path: str | Path, write: Callable[[IO[bytes]], Any]) -> None:
-    """Let `write` fill a temporary file and move it to `path`, so that no half-written file is ever seen.
-
-    Raises:
-        InputError: the folder cannot be written.
-    """
-    path = Path(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f'.{path.name}.')
-    except OSError as error:
-        raise InputError(f'{path}: cannot be written ({error.strerror}): choose another place') from None
-    try:
-        with open(handle, 'wb') as file:
-            write(file)
-        os.chmod(temporary, 0o644)  # mkstemp keeps its files to their owner
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise

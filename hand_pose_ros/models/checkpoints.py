@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from hand_pose_ros import __version__
 from hand_pose_ros.errors import CheckpointError, HandPoseError
+from hand_pose_ros.files import in_one_step
 from hand_pose_ros.models import build
 from hand_pose_ros.skeleton import get_skeleton
 
@@ -62,13 +63,8 @@ def save_checkpoint(path: str | Path, network: nn.Module, metadata: dict[str, An
         if tensor.is_floating_point() and not tensor.isfinite().all():
             raise CheckpointError(f"checkpoint {path} is not written: '{name}' holds values that are "
                                   'not finite or too large for float16 (did training diverge?)')
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f'.{path.name}.{os.getpid()}.tmp')
-    try:
-        save_file(tensors, temporary, metadata={'hand_pose_ros': json.dumps(described)})
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with in_one_step(path) as part:
+        save_file(tensors, part, metadata={'hand_pose_ros': json.dumps(described)})
 
 
 def load_checkpoint(name_or_path: str | PathLike[str] | None = None) -> Checkpoint:

@@ -22,7 +22,8 @@ from torch import nn
 from hand_pose_ros.datasets import Batch, joints_in_metres
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.evaluation import plots
-from hand_pose_ros.evaluation.results import Result, write_atomically, write_json
+from hand_pose_ros.evaluation.results import Result
+from hand_pose_ros.files import write_bytes, write_json
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.models import build
 from hand_pose_ros.models.checkpoints import Checkpoint, load_checkpoint
@@ -136,8 +137,8 @@ class Laboratory:
 
     def write(self, name: str, table: str, values: dict[str, Any], figure: Figure) -> str:
         """NAME.json, NAME.md, NAME.png and NAME.svg; returns the table."""
-        write_json({'recipe': dataclasses.asdict(self.recipe), **values}, self.folder / f'{name}.json')
-        write_atomically(self.folder / f'{name}.md', lambda file: file.write(table.encode()))
+        write_json(self.folder / f'{name}.json', {'recipe': dataclasses.asdict(self.recipe), **values})
+        write_bytes(self.folder / f'{name}.md', table.encode())
         plots.save(figure, self.folder / name)
         return table
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hand_pose_ros.errors import HandPoseError
-from hand_pose_ros.evaluation.results import write_json
+from hand_pose_ros.files import write_json
 from hand_pose_ros.training.recipes import Recipe, recipe_from_dict, recipe_to_dict
 
 log = logging.getLogger(__name__)
@@ -56,7 +56,7 @@ class RunFolder:
         if self.state.exists():
             raise TrainingError(f'{self.path} holds a run already: continue it with --resume, or choose another --out')
         self.path.mkdir(parents=True, exist_ok=True)
-        write_json({'recipe': recipe_to_dict(recipe), 'git': _git_revision()}, self.path / 'config.json')
+        write_json(self.path / 'config.json', {'recipe': recipe_to_dict(recipe), 'git': _git_revision()})
 
     def open(self) -> None:
         """Begin to write."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +13,14 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from hand_pose_ros.errors import CheckpointError
+from hand_pose_ros.files import in_one_step
 
 
 def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, Any]) -> None:
     """Write tensors and a JSON dictionary to one file that appears only when it is complete."""
-    temporary = path.with_name(f'.{path.name}.{os.getpid()}.tmp')
-    try:
-        save_file({key: value.detach().cpu().contiguous() for key, value in tensors.items()}, temporary,
+    with in_one_step(path) as part:
+        save_file({key: value.detach().cpu().contiguous() for key, value in tensors.items()}, part,
                   metadata={'json': json.dumps(metadata)})
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def save_state(path: Path, modules: dict[str, nn.Module], optimizer: Optimizer, progress: dict[str, Any]) -> None:

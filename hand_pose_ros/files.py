@@ -1,0 +1,44 @@
+"""Files that appear in one step, so that nobody ever sees half of one."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from hand_pose_ros.errors import InputError
+
+
+@contextmanager
+def in_one_step(path: str | Path) -> Iterator[Path]:
+    """A file beside `path` to write to, which becomes `path` when the block ends; after an error nothing is left.
+
+    Raises:
+        InputError: the folder cannot be made or written.
+    """
+    path = Path(path)
+    part = path.with_name(f'.{path.name}.{os.getpid()}.part')
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.touch()
+    except OSError as error:
+        raise InputError(f'{path}: cannot be written ({error.strerror}): choose another place') from None
+    try:
+        yield part
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def write_bytes(path: str | Path, data: bytes) -> None:
+    """Write a whole file in one step."""
+    with in_one_step(path) as part:
+        part.write_bytes(data)
+
+
+def write_json(path: str | Path, value: Any) -> None:
+    """Write strict JSON (no NaN) in one step."""
+    write_bytes(path, (json.dumps(value, indent=2, allow_nan=False) + '\n').encode())

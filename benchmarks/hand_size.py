@@ -24,7 +24,6 @@ from hand_pose_ros.models.dense import TOLD_SIZE
 from hand_pose_ros.skeleton import HAND21
 from hand_pose_ros.synthetic.generator import SyntheticHands
 
-CHAIN = [HAND21.joint_names.index(name) for name in ('middle_tip', 'middle_dip', 'middle_pip', 'middle_mcp', 'wrist')]
 CUBES = ('0.30 m', '0.285 m', 'true size', 'own size', 'tracked')
 
 
@@ -52,7 +51,7 @@ def main() -> None:
         for depth, camera, joints, side_of_hand in images:
             if side_of_hand == 'none':
                 continue
-            length = np.linalg.norm(np.diff(joints[CHAIN], axis=0), axis=1).sum()
+            length = np.linalg.norm(np.diff(joints[list(HAND21.middle_finger)], axis=0), axis=1).sum()
             center = joints.mean(0) + rng.normal(0, 0.008, 3)
             if args.frames > 1 and (center[2] < 0.1 or _share_inside(camera.project(joints), depth.shape) < 0.5):
                 continue

@@ -42,6 +42,14 @@ class Skeleton:
         return self.parents.index(-1)
 
     @property
+    def middle_finger(self) -> tuple[int, ...]:
+        """Indices from its tip to the root: the bones between them make the length of a hand."""
+        chain = [self.joint_names.index('middle_tip')]
+        while self.parents[chain[-1]] >= 0:
+            chain.append(self.parents[chain[-1]])
+        return tuple(chain)
+
+    @property
     def tips(self) -> tuple[int, ...]:
         """Indices of the fingertips, thumb to little finger."""
         return tuple(self.joint_names.index(f'{finger}_tip') for finger in FINGERS)

@@ -424,4 +424,5 @@ def test_every_skeleton_has_four_knuckles_and_a_root(skeleton):
     assert [skeleton.fingers[joint] for joint in sorted(skeleton.knuckles, key=lambda j: skeleton.fingers[j])] == [
         'index', 'middle', 'pinky', 'ring']
     assert skeleton.parents[skeleton.root] == -1 and skeleton.fingers[skeleton.root] == 'palm'
+    assert skeleton.middle_finger[-1] == skeleton.root and len(skeleton.middle_finger) >= 3
     build('two_looks', joints=len(skeleton), root=skeleton.root, knuckles=skeleton.knuckles, width=4)

@@ -72,7 +72,7 @@ class DenseObjective(PoseObjective):
 
     def __init__(self, network: nn.Module, recipe: Recipe, skeleton: Skeleton) -> None:
         super().__init__(network, recipe, skeleton)
-        self.middle_finger = _chain(skeleton)
+        self.middle_finger = list(skeleton.middle_finger)
 
     def forward(self, batch: Batch) -> Terms:
         out = self.network.forward_full(batch['patch'])  # type: ignore[operator]
@@ -225,11 +225,3 @@ def _counts(batch: Batch) -> Tensor:
 
 def _binary(logits: Tensor, target: Tensor) -> Tensor:
     return F.binary_cross_entropy_with_logits(logits.float(), target.float(), reduction='none')
-
-
-def _chain(skeleton: Skeleton) -> list[int]:
-    """The joints from the tip of the middle finger to the root: their bones make the length of the hand."""
-    chain = [skeleton.joint_names.index('middle_tip')]
-    while skeleton.parents[chain[-1]] >= 0:
-        chain.append(skeleton.parents[chain[-1]])
-    return chain

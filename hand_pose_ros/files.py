@@ -28,6 +28,7 @@ def in_one_step(path: str | Path) -> Iterator[Path]:
         raise InputError(f'{path}: cannot be written ({error.strerror}): choose another place') from None
     try:
         yield part
+        os.chmod(part, 0o644)  # some libraries keep their files to their owner
         os.replace(part, path)
     finally:
         part.unlink(missing_ok=True)

@@ -23,11 +23,10 @@ _EXAMPLES = """examples:
   hand-pose bench --json speed.json --threads 1
   hand-pose bench --model my.safetensors --quick
 
-Networks and frames are those of the weights that ship. All rows of a group run in
-turn, round by round, so that whatever else the machine does meets them alike. floor is the larger of two times, both
-measured in the same run: the operations at the rate of a large matrix product, and the weights read once by a
-matrix-vector product. cpu_ms is the CPU time of a call in all threads; with --threads 1 it is what the call takes
-when nothing else runs.
+Networks and frames are those of the weights that ship. All rows of a group run in turn, round by round, so that
+whatever else the machine does meets them alike. floor is the larger of two times, both measured in the same run: the
+operations at the rate of a large matrix product, and the weights read once by a matrix-vector product. cpu_ms is the
+CPU time of a call in all threads; with --threads 1 it is what the call takes when nothing else runs.
 """
 _WARM_UP = 5
 _CALLS = 10

@@ -2,7 +2,7 @@
 
 A hand may be turned any way in the image, and a network that sees it once spends most of what it can on that. Once it
 has told about where the joints are, the patch can be turned, moved and scaled so that every hand stands upright in the
-middle, as large as all others. The second network knows only such hands, and its pose prior is one of poses alone.
+middle, as large as all others. The second network is trained for such hands, and its pose prior is one of poses alone.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class View(NamedTuple):
         hand = torch.arange(patch.shape[0], device=patch.device, dtype=torch.int32)[:, None, None]
         seen = image[(hand * (size + 2) + row) * (size + 2) + column].float()
         depth = (seen - middle[:, 2, None, None]) / self.scale[:, None, None].float()
-        return torch.where(seen < 1, depth.clamp(-1, 1), 1.0)[:, None].to(patch.dtype)
+        return torch.where(seen < 1, depth.clamp(-1, 1), torch.ones_like(depth))[:, None].to(patch.dtype)
 
 
 class TwoLooks(nn.Module):
@@ -117,7 +117,7 @@ class TwoLooks(nn.Module):
     def upright(self, joints: Tensor, size: Tensor) -> View:
         """Where to look from at joints (B, J, 3) of a hand of this size (B,), the logarithm over the usual one."""
         joints, size = joints.float(), size.float()
-        # No constant and no index comes from a list: a copy from the host is what a CUDA graph cannot hold.
+        # No constant and no index comes from a list, here or above: a CUDA graph cannot hold a copy from the host.
         up = torch.stack([joints[:, k, :2] for k in self.knuckles]).mean(dim=0) - joints[:, self.root, :2]
         # Of a hand that points along the ray any direction will do, but one must.
         up = up - 1e-6 * torch.arange(2, device=up.device)

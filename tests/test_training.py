@@ -1,11 +1,13 @@
 """Training learns, can be stopped and continued anywhere, and gives the same result on any number of processes."""
 
+import copy
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
+from torch import nn
 
 from hand_pose_ros.cli import main
 from hand_pose_ros.cli.experiment import NAMES
@@ -30,7 +33,7 @@ from hand_pose_ros.training.folder import TrainingError
 from hand_pose_ros.training.loop import Machine, Run
 from hand_pose_ros.training.losses import joint_loss
 from hand_pose_ros.training.objectives import objective_for
-from hand_pose_ros.training.optimizers import learning_rate
+from hand_pose_ros.training.optimizers import learning_rate, make_optimizer, orthogonal
 from hand_pose_ros.training.recipes import RECIPES, get_recipe, recipe_from_dict, recipe_to_dict
 from hand_pose_ros.training.stream import SampleStream
 
@@ -238,6 +241,42 @@ def test_schedules():
     rates = [learning_rate(modern, progress) for progress in (0, modern.warmup, 0.5, 1)]
     assert rates[0] == 0 and rates[1] > 0.99 * modern.learning_rate and rates[3] < 1e-9
     assert rates[2] == pytest.approx(modern.learning_rate / 2)
+
+
+def test_steps_of_muon_move_all_directions_equally_far():
+    """Even where nearly all of a gradient is one direction; and the matrix keeps its rows and columns apart."""
+    random = torch.Generator().manual_seed(0)
+    for rows, columns in ((4, 36), (36, 4), (16, 16)):
+        left, _, right = torch.linalg.svd(torch.randn(rows, columns, generator=random), full_matrices=False)
+        strengths = torch.logspace(0, -2, min(rows, columns))
+        made = left.T @ orthogonal(left * strengths @ right) @ right.T
+        assert ((made.diagonal() > 0.6) & (made.diagonal() < 1.2)).all()
+        torch.testing.assert_close(made, made.diagonal().diag(), atol=1e-4, rtol=0)
+    assert (orthogonal(torch.zeros(4, 9)) == 0).all()
+
+
+def test_muon_descends_convolutions_its_way_and_the_rest_as_adamw_does():
+    torch.manual_seed(0)
+    network = nn.Sequential(nn.Conv2d(1, 4, 3), nn.ReLU(), nn.Flatten(), nn.Linear(4 * 36, 2))
+    twin = copy.deepcopy(network)
+    patch, recipe = torch.randn(32, 1, 8, 8), get_recipe('modern', ['learning_rate=0.003'])
+    aim = patch.mean((2, 3)) * torch.tensor([1.0, -2.0])
+    losses = []
+    for net, name in ((network, 'muon'), (twin, 'adamw')):
+        optimizer = make_optimizer(replace(recipe, optimizer=name), net)
+        before = copy.deepcopy(net.state_dict())
+        for step in range(60):
+            loss = (net(patch) - aim).square().mean()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            if step == 0:
+                first, moved = loss.item(), {key: net.state_dict()[key] - before[key] for key in before}
+        losses.append((first, loss.item(), moved))
+    (start, end, muon), (_, _, adamw) = losses
+    assert end < start / 5
+    assert all(torch.equal(muon[key], adamw[key]) for key in ('0.bias', '3.weight', '3.bias'))
+    assert not torch.allclose(muon['0.weight'], adamw['0.weight'], rtol=0.1, atol=0)
 
 
 def test_any_value_of_a_recipe_can_be_replaced():
@@ -511,6 +550,30 @@ def test_a_network_starts_from_another_and_gets_a_prior_if_that_had_none(folder,
         tiny(folder, f'base={path}', out=tmp_path / 'third')
 
 
+def test_a_network_with_further_blocks_starts_as_the_one_it_grew_from(folder, tmp_path):
+    facts, base = {'skeleton': 'icvl16', 'cube_side': 0.3}, tmp_path / 'base.safetensors'
+    network = build('hand_dense', joints=16, width=8, bottleneck=8)
+    for norm in (part for part in network.modules() if isinstance(part, nn.BatchNorm2d)):
+        nn.init.uniform_(norm.weight, 0.5, 1)  # as after training: none is zero
+    save_checkpoint(base, network, facts, half=False)
+    wanted = ('network=hand_dense', 'options.width=8', f'base={base}')
+    run = tiny(folder, *wanted, 'options.blocks=[1,2,1,3]', 'samples=40', recipe='modern', out=tmp_path / 'grown')
+    patch = run.shards.read(0)['patch'].float()
+    with torch.no_grad():
+        answers = [each.forward_full(patch) for each in (run.objective.network.eval(), load_checkpoint(base).network)]
+    for name in answers[1]:
+        torch.testing.assert_close(answers[0][name], answers[1][name], atol=1e-5, rtol=0)
+    run.train()
+    grown = load_checkpoint(tmp_path / 'grown' / 'last.safetensors').network
+    assert grown.config['blocks'] == [1, 2, 1, 3] and grown.stages[3][2].body[2][1].weight.abs().max() > 0
+    for other in ('options.blocks=[2,1,1]', 'options.blocks=[1,0,1,1]'):
+        with pytest.raises(HandPoseError, match='give four numbers'):
+            tiny(folder, *wanted, other, out=tmp_path / 'never')
+    with pytest.raises(TrainingError, match='holds another network'):  # fewer blocks than its base has
+        tiny(folder, 'network=hand_dense', 'options.width=8', f'base={tmp_path / "grown" / "last.safetensors"}',
+             out=tmp_path / 'fewer')
+
+
 def test_the_second_look_learns_behind_a_first_which_stays(folder, tmp_path):
     facts = {'skeleton': 'icvl16', 'cube_side': 0.3}
     small, large = tmp_path / 'small.safetensors', tmp_path / 'large.safetensors'
@@ -522,7 +585,8 @@ def test_the_second_look_learns_behind_a_first_which_stays(folder, tmp_path):
             tiny(folder, *wanted, f'base={base}', out=tmp_path / 'never')
     run = tiny(folder, *wanted, f'first={small}', f'base={large}', 'samples=40', recipe='modern', out=tmp_path / 'run')
     network, base = run.objective.network, load_checkpoint(large).network.state_dict()
-    assert network.config['knuckles'] == (4, 7, 10, 13) and network.config['first'] == {'width': 4, 'bottleneck': 8}
+    assert network.config['knuckles'] == (4, 7, 10, 13) and network.config['first'] == {
+        'width': 4, 'bottleneck': 8, 'blocks': [1, 1, 1, 1]}
     second = network.second.state_dict()
     equal = {name for name in base if torch.equal(base[name], second[name])}
     assert all(name.startswith('head.') for name in base.keys() - equal) and len(equal) < len(base)

@@ -7,6 +7,8 @@ pose prior of the paper makes one hand of the joints.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from numpy.typing import ArrayLike
@@ -76,17 +78,26 @@ class HandDense(nn.Module):
         joints: J.
         width: channels of the first stage; the cost grows with its square.
         bottleneck: coefficients of the pose prior behind the votes; None = the votes as they are.
+        blocks: residual blocks of each stage.
+
+    Raises:
+        HandPoseError: there are not four stages of at least one block.
     """
 
     outputs = ('joints', 'confidence', 'hand', 'side', 'size')
 
-    def __init__(self, joints: int = 21, width: int = 32, bottleneck: int | None = None) -> None:
+    def __init__(self, joints: int = 21, width: int = 32, bottleneck: int | None = None,
+                 blocks: Sequence[int] = (1, 1, 1, 1)) -> None:
         super().__init__()
-        self.joints, self.width, self.bottleneck = joints, width, bottleneck
+        if len(blocks) != 4 or min(blocks) < 1:
+            raise HandPoseError(f'blocks {list(blocks)}: give four numbers, each at least 1')
+        self.joints, self.width, self.bottleneck, self.blocks = joints, width, bottleneck, list(blocks)
         w = width
         self.stem = nn.Sequential(conv_norm(1, w, 5, stride=2), nn.ReLU(), nn.MaxPool2d(2))
-        self.stages = nn.ModuleList([Residual(w, w, 1), Residual(w, 2 * w, 2),
-                                     Residual(2 * w, 4 * w, 2), Residual(4 * w, 8 * w, 2)])
+        self.stages = nn.ModuleList()
+        for inputs, outputs, count in zip((w, w, 2 * w, 4 * w), (w, 2 * w, 4 * w, 8 * w), blocks, strict=True):
+            further = [Residual(outputs, outputs, 1) for _ in range(count - 1)]
+            self.stages.append(nn.Sequential(Residual(inputs, outputs, 1 if inputs == outputs else 2), *further))
         self.laterals = nn.ModuleList(nn.Conv2d(k * w, 2 * w, 1) for k in (1, 2, 4, 8))
         self.fuse = nn.Sequential(conv_norm(2 * w, 2 * w, 3), nn.ReLU())
         self.maps = nn.Conv2d(2 * w, 4 * joints, 1)
@@ -147,12 +158,19 @@ def pyramid(x: Tensor, stages: nn.ModuleList, laterals: nn.ModuleList) -> tuple[
 
 
 class Residual(nn.Module):
-    """Two 3x3 convolutions beside the identity, or beside a 1x1 projection where the shape changes (He et al. 2016)."""
+    """Two 3x3 convolutions beside the identity, or beside a 1x1 projection where the shape changes (He et al. 2016).
+
+    One that changes no shape starts as the identity (Goyal et al. 2017), so that it can be added to a trained network.
+    """
 
     def __init__(self, inputs: int, outputs: int, stride: int) -> None:
         super().__init__()
         self.body = nn.Sequential(conv_norm(inputs, outputs, 3, stride), nn.ReLU(), conv_norm(outputs, outputs, 3))
-        self.shortcut = nn.Identity() if inputs == outputs and stride == 1 else conv_norm(inputs, outputs, 1, stride)
+        self.shortcut: nn.Module = nn.Identity()
+        if inputs != outputs or stride != 1:
+            self.shortcut = conv_norm(inputs, outputs, 1, stride)
+        else:
+            nn.init.zeros_(self.body[2][1].weight)
 
     def forward(self, x: Tensor) -> Tensor:
         return F.relu(self.body(x) + self.shortcut(x))

@@ -218,7 +218,7 @@ def fine_tune(network: nn.Module, recorded: Batch, synthetic: Batch, steps: int,
     """
     original = list(network.parameters())
     network = copy.deepcopy(network).requires_grad_(True).eval()  # norms keep their statistics: two sorts of samples
-    recipe = replace(RECIPES['modern'], learning_rate=RATE, warmup=0.1)
+    recipe = replace(RECIPES['modern'], optimizer='adamw', learning_rate=RATE, warmup=0.1)
     objective = objective_for(network, recipe, HAND21)
     objective = objective.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = make_optimizer(recipe, network)

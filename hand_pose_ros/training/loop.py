@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 import os
+import re
 import signal
 import time
 from collections.abc import Iterator
@@ -41,6 +42,8 @@ log = logging.getLogger(__name__)
 
 CUBE_SIDE = 0.30
 """Metres; what a checkpoint recommends to whoever runs it."""
+FURTHER_BLOCK = re.compile(r'\bstages\.\d+\.[1-9]\d*\.')
+"""Weights of a block that changes no shape."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +146,7 @@ class Run:
         if recipe.network == 'two_looks':
             first = self._first_look(base)
             given |= {'root': self.skeleton.root, 'knuckles': self.skeleton.knuckles,
-                      'first': {'width': first.width, 'bottleneck': first.bottleneck}}
+                      'first': {key: getattr(first, key) for key in ('width', 'bottleneck', 'blocks')}}
         if taken := sorted(given.keys() & recipe.options.keys()):
             raise TrainingError(f'--set options.{taken[0]}: this follows from the dataset; leave it out')
         network = build(recipe.network, **given, **recipe.options)
@@ -172,9 +175,10 @@ class Run:
         return first
 
     def _start_from(self, network: nn.Module, base: Checkpoint) -> bool:
-        """Take the weights of the base; False if it has none for the prior, which is all that it may lack.
+        """Take the weights of the base; False if it has none for the prior.
 
-        The second of two looks may start as any hand_dense, but that its prior is another.
+        That it may lack, and further blocks of a stage, which start as the identity. The second of two looks may
+        start as any hand_dense, but that its prior is another.
         """
         own = base.network.state_dict()
         if isinstance(network, TwoLooks):
@@ -182,14 +186,15 @@ class Run:
                 own = {f'second.{name}': value for name, value in own.items() if not name.startswith('head.')}
             own |= {f'first.{name}': value for name, value in network.first.state_dict().items()}
         lacking = network.state_dict().keys() - own.keys()
+        prior = {name for name in lacking if 'head' in name.split('.')}
         try:
-            if not all('head' in name.split('.') for name in lacking):
-                raise RuntimeError(f'{min(lacking)} is missing')
+            if needed := [name for name in lacking - prior if not FURTHER_BLOCK.search(name)]:
+                raise RuntimeError(f'{min(needed)} is missing')
             network.load_state_dict({**network.state_dict(), **own})
         except RuntimeError as error:
             raise TrainingError(f'{self.recipe.base} holds another network than the recipe names '
                                 f'({self.recipe.network}, {self.recipe.options})') from error
-        return not lacking
+        return not prior
 
     def _training_poses(self, objective: PoseObjective) -> Tensor:
         """Poses as the network will meet them: one shard, augmented in several ways, is plenty for a covariance."""

@@ -165,12 +165,13 @@ class Residual(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, stride: int) -> None:
         super().__init__()
-        self.body = nn.Sequential(conv_norm(inputs, outputs, 3, stride), nn.ReLU(), conv_norm(outputs, outputs, 3))
+        last = conv_norm(outputs, outputs, 3)
+        self.body = nn.Sequential(conv_norm(inputs, outputs, 3, stride), nn.ReLU(), last)
         self.shortcut: nn.Module = nn.Identity()
         if inputs != outputs or stride != 1:
             self.shortcut = conv_norm(inputs, outputs, 1, stride)
         else:
-            nn.init.zeros_(self.body[2][1].weight)
+            nn.init.zeros_(last[1].weight)  # type: ignore[arg-type]
 
     def forward(self, x: Tensor) -> Tensor:
         return F.relu(self.body(x) + self.shortcut(x))

@@ -90,7 +90,7 @@ class TwoLooks(nn.Module):
         if not all(0 <= joint < joints for joint in (root, *knuckles)) or not knuckles:
             raise HandPoseError(f'root {root} and knuckles {list(knuckles)} are not all among {joints} joints')
         self.joints, self.root, self.knuckles = joints, root, list(knuckles)
-        second = {'width': width, 'bottleneck': bottleneck, 'blocks': blocks}
+        second: dict[str, Any] = {'width': width, 'bottleneck': bottleneck, 'blocks': blocks}
         self.first = HandDense(joints, **(first or second))
         self.first.requires_grad_(False).eval()
         self.second = HandDense(joints, **second)

@@ -36,11 +36,13 @@ class FlooredRMSProp(Optimizer):
 class Muon(torch.optim.AdamW):
     """AdamW, but that the weights of convolutions take steps that are orthogonal matrices (Jordan et al. 2024, Muon).
 
-    Such a step moves all directions of a weight equally far, not only those that most gradients share. It is as large
-    as one of AdamW usually is (Liu et al. 2025, Muon is Scalable for LLM Training): both have one learning rate.
+    Such a step moves all directions of a weight equally far, not only those that most gradients share.
     """
 
     MOMENTUM = 0.95
+    STEP = 0.8
+    """Root mean square of a step at a learning rate of 1. With 0.2 it is as large as one of AdamW usually is (Liu et
+    al. 2025, Muon is Scalable for LLM Training); our small networks want four times that."""
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> None:  # type: ignore[override]
@@ -55,7 +57,8 @@ class Muon(torch.optim.AdamW):
                 state['momentum'].lerp_(parameter.grad, 1 - self.MOMENTUM)
                 step = parameter.grad.lerp(state['momentum'], self.MOMENTUM).flatten(1)  # Nesterov's
                 parameter.mul_(1 - group['lr'] * group['weight_decay'])
-                parameter.add_(orthogonal(step).view_as(parameter), alpha=-0.2 * group['lr'] * max(step.shape) ** 0.5)
+                size = self.STEP * group['lr'] * max(step.shape) ** 0.5  # of an orthogonal matrix every entry is small
+                parameter.add_(orthogonal(step).view_as(parameter), alpha=-size)
                 parameter.grad = None  # the rest is for AdamW
         super().step()
 

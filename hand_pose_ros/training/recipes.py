@@ -83,7 +83,7 @@ RECIPES = {
     # Muon with cosine decay, which needs half the samples of AdamW (docs/training.md), and averaged weights, worth a
     # step of the decay.
     'modern': Recipe(network='hand_dense', augmentation=PRESETS['modern'], loss='smooth_l1', knee=0.01,
-                     optimizer='muon', learning_rate=8e-3, schedule='cosine', warmup=0.02, weight_decay=0.01,
+                     optimizer='muon', learning_rate=2e-3, schedule='cosine', warmup=0.02, weight_decay=0.01,
                      batch_size=64, samples=2_000_000, precision='bfloat16', average=0.998),
     # The same for what finds hands in whole images; its objective has its own augmentation.
     'finder': Recipe(network='hand_finder', options={}, dataset='scenes', reuse=10, optimizer='adamw',

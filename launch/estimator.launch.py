@@ -15,7 +15,7 @@ SHARE = Path(__file__).resolve().parents[1]
 def generate_launch_description() -> LaunchDescription:
     """The node, and RViz if asked for. The node configures and activates itself, so nothing else is needed."""
     arguments = {
-        'depth_topic': ('/depth/image_rect', 'Depth image, without its transport; camera_info is beside it.'),
+        'depth_topic': ('depth/image_rect', 'Depth image, without its transport; camera_info is beside it.'),
         'params_file': (str(SHARE / 'config' / 'estimator.yaml'), 'Parameters of the node.'),
         'namespace': ('', 'Namespace of the node and its topics.'),
         'use_sim_time': ('false', 'Take the time from /clock (bags played with --clock).'),

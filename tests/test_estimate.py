@@ -132,9 +132,10 @@ def test_markers_are_in_the_bag_without_ros(tmp_path, depths, weights, monkeypat
     np.testing.assert_allclose((joints.colors[tip].r, joints.colors[tip].g, joints.colors[tip].b), color, atol=1e-6)
 
 
-def test_images_without_a_hand_are_answered_too(tmp_path, bag, weights):
+def test_images_without_a_hand_are_answered_too(tmp_path, bag, weights, capsys):
     args = ['estimate', str(bag), '--model', str(weights), '--min-score', '1']
     assert main([*args, '--out', str(tmp_path / 'a.mcap')]) == main([*args, '--out', str(tmp_path / 'a.npz')]) == 0
+    assert 'nothing had a score of 1 or more' in capsys.readouterr().err
     assert [len(record.joints) for record in read_hands(tmp_path / 'a.mcap')] == [0] * 6
     result = np.load(tmp_path / 'a.npz')
     assert result['joints'].shape == (0, 21, 3) and result['stamp_ns'].tolist() == STAMPS

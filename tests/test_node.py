@@ -547,7 +547,7 @@ def test_incompatible_quality_of_service_is_named_with_its_remedy(rig: Rig) -> N
     rig.start(**{'qos_overrides./depth/image_rect.subscription.reliability': 'reliable'})
     rig.client.create_publisher(Image, 'depth/image_rect', BEST_EFFORT)
     rig.until_said('does not offer', '/depth/image_rect', '/client', 'best effort',
-                   'qos_overrides./depth/image_rect.subscription.reliability')
+                   '-p qos_overrides./depth/image_rect.subscription.reliability:=best_effort')
 
 
 def test_a_wrong_quality_of_service_is_named(rig: Rig) -> None:

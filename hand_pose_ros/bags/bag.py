@@ -130,13 +130,16 @@ def _remedy(path: Path) -> str:
     if path.is_file() and not path.stat().st_size:
         return 'it is empty: record or copy it again'
     if path.suffix == '.bag':
-        return f'if it was cut short, repair a copy with: rosbag reindex {path.name}'
+        return f'if it was cut short, repair a copy with: rosbag reindex {path}'
     if path.suffix == '.mcap':
-        return f'repair it with: mcap recover {path.name} -o repaired.mcap'
+        with open(path, 'rb') as file:
+            if file.read(5) != b'\x89MCAP':
+                return 'it is no MCAP file: give a .bag, .mcap or .db3 file or the folder of a ROS 2 bag'
+        return f'repair it with mcap (github.com/foxglove/mcap): mcap recover {path} -o repaired.mcap'
     if path.suffix == '.db3':
-        return f'repair it with: sqlite3 {path.name} .recover | sqlite3 repaired.db3'
+        return f'repair it with: sqlite3 {path} .recover | sqlite3 repaired.db3'
     wanted = 'give a .bag, .mcap or .db3 file or the folder of a ROS 2 bag'
-    return f'{wanted}, or repair that folder with: ros2 bag reindex {path.name}' if path.is_dir() else wanted
+    return f'{wanted}, or repair that folder with: ros2 bag reindex {path}' if path.is_dir() else wanted
 
 
 class _InterruptedMcap:

@@ -130,8 +130,10 @@ def estimate(images: Iterator[DepthInput], count: int, estimator: HandPoseEstima
         sink.finish()
     print(f'{done} image{"s" if done > 1 else ""}, {found} with a hand, {failed} that could not be used; '
           f'{1000 * float(np.median(seconds)):.1f} ms for the median image')
-    if problem and not found:
-        print(f'hand-pose estimate: {problem}', file=sys.stderr)
+    if not found:
+        hint = (f'nothing had a score of {estimator.min_score:g} or more, which a network that was hardly trained does '
+                'not reach: --min-score 0 shows what is most like a hand')
+        print(f'hand-pose estimate: {problem or hint}', file=sys.stderr)
     return 1 if failed else 0
 
 

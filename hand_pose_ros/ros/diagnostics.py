@@ -124,7 +124,9 @@ def _judge(window: _Window, state: str, published: bool, silence: str) -> tuple[
                                        f'arrived in a second: if there should be as many, {remedy_for_lost_images()}')
     if counts['received'] == 0:
         return DiagnosticStatus.STALE, silence or 'no images'
-    if counts['received'] >= MIN_SAMPLE and counts['dropped'] > MAX_DROPPED * counts['received']:
+    # Where none was answered, they wait for something, like their camera_info, and that is said in its time.
+    too_many = counts['dropped'] > MAX_DROPPED * counts['received']
+    if counts['received'] >= MIN_SAMPLE and counts['answered'] and too_many:
         return DiagnosticStatus.WARN, (f'{counts["dropped"]} of {counts["received"]} images of a second were dropped: '
                                        'this machine is too slow, or too busy, for their rate')
     return DiagnosticStatus.OK, f'{counts["answered"]} images answered, {counts["hands"]} hands'

@@ -56,6 +56,8 @@ def _logged(transition: _Transition) -> _Transition:
             result, self._statistics.failure = TransitionCallbackReturn.FAILURE, str(error)
         except Exception:
             result = TransitionCallbackReturn.ERROR
+            if not self.context.ok():  # Ctrl-C, which leaves nothing to be made or said
+                return result
             self._statistics.failure = f'unexpected error, please report it:\n{traceback.format_exc()}'
         self._stop()
         self.get_logger().error(self._statistics.failure)
@@ -71,6 +73,7 @@ class EstimatorNode(LifecycleNode):
         self._estimator: HandPoseEstimator | None = None
         self._worker: NewestWorker[Image | CompressedImage] | None = None
         self._inputs: list[Subscription] = []
+        self._published = False  # does anybody publish images?
         self._reset = False  # asked for; the worker, who alone touches the estimator, does it
         super().__init__('estimator', **kwargs)
         self._params = parameters.declare(self)
@@ -83,8 +86,11 @@ class EstimatorNode(LifecycleNode):
         self.create_service(Trigger, '~/reset', self._on_reset)
         # Steady: with simulated time that stands still the node must still say so.
         self.create_timer(1.0, self._on_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        if self._params.autostart and self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
-            self.trigger_activate()
+        if self._params.autostart:
+            if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
+                self.trigger_activate()
+            else:
+                self.get_logger().error('so the node does nothing: end it and start it anew, or configure it again')
 
     # Lifecycle
 
@@ -208,12 +214,15 @@ class EstimatorNode(LifecycleNode):
 
     def _on_timer(self) -> None:
         listening = self._worker is not None
+        published = listening and self.count_publishers(self._image_topic) > 0
+        if published and not self._published:  # who has just come, as a bag that is replayed, may take its time
+            self._heard_at = time.monotonic()
+        self._published = published
         if listening and time.monotonic() - self._heard_at > SILENCE_S:
             silence = topics.explain_silence(self, self._image_topic, self._image_type, SILENCE_S)
             if silence != self._statistics.silence:  # who publishes what may change meanwhile, and the remedy with it
                 self._statistics.silence = silence
                 self._complain(silence)
-        published = listening and self.count_publishers(self._image_topic) > 0
         status = self._statistics.report(self.get_name(), self._state, published, self._facts())
         if status.level == DiagnosticStatus.WARN:
             self._say(status.message)

@@ -7,6 +7,7 @@ from typing import Any
 
 from rclpy.node import Node
 from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.ros import qos
@@ -58,11 +59,17 @@ def subscribe(node: Node, message_type: type, topic: str, callback: Callable[...
 def describe_publishers(node: Node, topic: str) -> str:
     """Who publishes on a topic and how, e.g. `published by /camera (sensor_msgs/msg/Image, best effort, volatile)`."""
     publishers = [
-        f'{info.node_namespace.rstrip("/")}/{info.node_name} ({info.topic_type}, '
+        f'{_name(info)} ({info.topic_type}, '
         f'{info.qos_profile.reliability.name.lower().replace("_", " ")}, '
         f'{info.qos_profile.durability.name.lower().replace("_", " ")})'
         for info in node.get_publishers_info_by_topic(topic)]
     return 'published by ' + ', '.join(sorted(publishers)) if publishers else 'without any publisher'
+
+
+def _name(publisher: TopicEndpointInfo) -> str:
+    if publisher.node_name == '_NODE_NAME_UNKNOWN_':  # before its node is discovered
+        return 'a node'
+    return f'{publisher.node_namespace.rstrip("/")}/{publisher.node_name}'
 
 
 def explain_silence(node: Node, topic: str, message_type: type, seconds: float) -> str:
@@ -96,6 +103,7 @@ def remedy_for_lost_images() -> str:
 
 def explain_incompatible(node: Node, topic: str, policy: str) -> str:
     """One sentence for a publisher whose quality of service does not fit the subscription."""
+    fits = {'reliability': 'best_effort', 'durability': 'volatile'}.get(policy, '...')
     return (f'a publisher on {topic} does not offer the {policy} that was asked for, so nothing arrives from it (the '
-            f'topic is {describe_publishers(node, topic)}): set the parameter '
-            f'qos_overrides.{topic}.subscription.{policy}')
+            f'topic is {describe_publishers(node, topic)}): start this node '
+            f'with --ros-args -p qos_overrides.{topic}.subscription.{policy}:={fits}')

@@ -250,7 +250,7 @@ def test_hands_come_back_as_written(tmp_path):
         for i, h in enumerate(present):
             np.testing.assert_array_equal(record.joints[i], h.joints)
             np.testing.assert_array_equal(record.confidence[i], h.confidence)
-    with pytest.raises(InputError, match='named /other'):
+    with pytest.raises(InputError, match='named /other, but the bag has /hand/joints'):
         read_hands(tmp_path / 'hands.mcap', topic='/other')
 
 

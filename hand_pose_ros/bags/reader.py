@@ -186,11 +186,13 @@ def read_hands(path: str | os.PathLike[str], topic: str | None = None) -> list[R
         InputError: no such topic, several to choose from, or a damaged bag.
     """
     with Bag(path) as bag:
-        found = [c for c in bag.connections if c.msgtype == HANDS and topic in (None, c.topic)]
+        hands = [c for c in bag.connections if c.msgtype == HANDS]
+        found = [c for c in hands if topic in (None, c.topic)]
         topics = sorted({c.topic for c in found})
         if len(topics) != 1:
+            there = ', '.join(sorted({c.topic for c in hands}))
             raise InputError(f'{path}: needed is one topic of {_ros_name(HANDS)}{f" named {topic}" if topic else ""}, '
-                             f'but the bag has {", ".join(topics) or "none"}: give the name of the topic')
+                             f'but the bag has {there or "none"}: give the name of the topic')
         return [_recorded_hands(bag.deserialize(c, data), f'{path}: {topics[0]}') for c, _, data in bag.messages(found)]
 
 

@@ -325,6 +325,7 @@ def test_unknown_weights_are_named_and_can_be_corrected(rig: Rig) -> None:
     rig.start(model='/nowhere/weights.safetensors')
     assert rig.state() == 'unconfigured'
     rig.until_said('/nowhere/weights.safetensors')
+    rig.until_said('the node does nothing')
     assert rig.set_parameter('model', str(rig.weights))[0]
     assert rig.transition('configure') and rig.transition('activate')
     assert rig.answer(rig.camera(info=camera_info()), image(depth_with_hand())).hands
@@ -412,6 +413,17 @@ def test_without_camera_info_the_remedy_is_named_and_works(rig: Rig) -> None:
     node.set_parameters_atomically([Parameter(f'intrinsics.{name}', value=value) for name, value in
                                     (('fx', FOCAL), ('fy', FOCAL), ('cx', WIDTH / 2), ('cy', HEIGHT / 2))])
     assert rig.answer(publish, image(depth_with_hand())).hands
+
+
+def test_a_machine_is_not_called_slow_while_camera_info_is_missing(rig: Rig) -> None:
+    rig.start(camera_info_timeout=1.5)  # images that wait are replaced by newer ones
+    publish, picture = rig.camera(RELIABLE), image(depth_with_hand())
+    end = time.monotonic() + 3.5
+    while time.monotonic() < end:
+        publish(picture)
+        time.sleep(0.02)
+    rig.until_said('/depth/camera_info')
+    assert not any('too slow' in text for text in rig.said())
 
 
 def test_an_image_waits_for_the_camera_info_that_comes_after_it(rig: Rig) -> None:

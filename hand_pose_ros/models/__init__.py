@@ -52,6 +52,9 @@ def build(architecture: str, **config: Any) -> nn.Module:
                             f"it takes {', '.join(signature.parameters)}")
     arguments = signature.bind(**config)
     arguments.apply_defaults()  # a checkpoint must not depend on the defaults of its reader
-    network = make(**arguments.arguments)
+    try:
+        network = make(**arguments.arguments)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise HandPoseError(f"architecture '{architecture}' cannot be made with {config}: {error}") from error
     vars(network).update(architecture=architecture, config=dict(arguments.arguments))
     return network

@@ -89,8 +89,8 @@ class EstimatorNode(LifecycleNode):
         if self._params.autostart:
             if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
                 self.trigger_activate()
-            else:
-                self.get_logger().error('so the node does nothing: end it and start it anew, or configure it again')
+            elif self.context.ok():
+                self.get_logger().error('so the node does nothing: correct this and configure it, or start it anew')
 
     # Lifecycle
 

@@ -217,11 +217,11 @@ def test_fine_tuning_learns_the_labels_and_leaves_the_original_alone(monkeypatch
     torch.manual_seed(0)
     network = build('hand_dense', joints=21, width=4, bottleneck=8).requires_grad_(False).eval()
     before = {name: value.clone() for name, value in network.state_dict().items()}
-    tuned = fine_tune(network, samples, samples, 24, at_once)
+    tuned = fine_tune(network, samples, samples, 48, at_once)
     assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
     assert all(torch.equal(value, before[name]) for name, value in tuned.state_dict().items() if 'running' in name)
     off = [(each(samples['patch']) - samples['joints']).norm(dim=-1).mean() for each in (network, tuned)]
-    assert off[1] < 0.95 * off[0]
+    assert off[1] < 0.9 * off[0]
 
 
 GOOD = {'found': 1.0, 'error_mm': None, 'disagreement_mm': 6.0, 'jitter_mm': 3.0, 'bone_drift_mm': 4.0,

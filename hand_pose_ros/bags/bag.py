@@ -127,6 +127,7 @@ def _open(path: Path) -> tuple[AnyReader, bool]:
 
 
 def _remedy(path: Path) -> str:
+    wanted = 'give a .bag, .mcap or .db3 file or the folder of a ROS 2 bag'
     if path.is_file() and not path.stat().st_size:
         return 'it is empty: record or copy it again'
     if path.suffix == '.bag':
@@ -134,11 +135,10 @@ def _remedy(path: Path) -> str:
     if path.suffix == '.mcap':
         with open(path, 'rb') as file:
             if file.read(5) != b'\x89MCAP':
-                return 'it is no MCAP file: give a .bag, .mcap or .db3 file or the folder of a ROS 2 bag'
+                return f'it is no MCAP file: {wanted}'
         return f'repair it with mcap (github.com/foxglove/mcap): mcap recover {path} -o repaired.mcap'
     if path.suffix == '.db3':
         return f'repair it with: sqlite3 {path} .recover | sqlite3 repaired.db3'
-    wanted = 'give a .bag, .mcap or .db3 file or the folder of a ROS 2 bag'
     return f'{wanted}, or repair that folder with: ros2 bag reindex {path}' if path.is_dir() else wanted
 
 

@@ -7,6 +7,7 @@ pose prior of the paper makes one hand of the joints.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 import torch
@@ -27,6 +28,8 @@ TOLD_SIZE = 0.19 / 0.30
 the tip of the middle finger."""
 SHARPNESS = 30.0
 """Weight of a vote: exp(SHARPNESS * closeness)."""
+FURTHER_BLOCK = re.compile(r'\bstages\.\d+\.[1-9]\d*\.')
+"""Finds, in the name of a weight, a block of a stage behind its first: it starts as the identity."""
 
 
 def cells(patch: Tensor) -> tuple[Tensor, Tensor]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import logging
 import os
-import re
 import signal
 import time
 from collections.abc import Iterator
@@ -26,7 +25,7 @@ from hand_pose_ros.datasets.memory import keep_freed_memory
 from hand_pose_ros.datasets.shards import DiskShards, MemoryShards
 from hand_pose_ros.models import build
 from hand_pose_ros.models.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
-from hand_pose_ros.models.dense import HandDense
+from hand_pose_ros.models.dense import FURTHER_BLOCK, HandDense
 from hand_pose_ros.models.prior import fit_prior
 from hand_pose_ros.models.two_looks import TwoLooks
 from hand_pose_ros.training.augmentation import PRESETS, augment
@@ -42,8 +41,6 @@ log = logging.getLogger(__name__)
 
 CUBE_SIDE = 0.30
 """Metres; what a checkpoint recommends to whoever runs it."""
-FURTHER_BLOCK = re.compile(r'\bstages\.\d+\.[1-9]\d*\.')
-"""Weights of a block that changes no shape."""
 
 
 @dataclass(frozen=True)

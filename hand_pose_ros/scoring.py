@@ -67,18 +67,19 @@ def _explained(surface: NDArray[np.float32], joints: NDArray[np.floating], half:
     if len(rows) == 0:
         return 0.0
     scale = 2 / surface.shape[0]
-    points = np.stack([(columns + 0.5) * scale - 1, (rows + 0.5) * scale - 1, surface[rows, columns]], axis=1)
+    points = np.stack([(columns + 0.5) * scale - 1, (rows + 0.5) * scale - 1, surface[rows, columns]], dtype=np.float32)
+    joints = joints.astype(np.float32)
     if {'wrist', 'middle_mcp'} <= set(skeleton.joint_names):
         wrist, knuckle = (joints[skeleton.joint_names.index(name)] for name in ('wrist', 'middle_mcp'))
-        points = points[(points - wrist) @ (knuckle - wrist) > 0]
-        if len(points) == 0:
+        points = points[:, (knuckle - wrist) @ points > (knuckle - wrist) @ wrist]
+        if points.shape[1] == 0:
             return 0.0
     parents, children = np.array(skeleton.bones).T
     start, bone = joints[parents], joints[children] - joints[parents]
-    # |p - (a + t b)|^2 over all points and bones, with t clamped to the bone, from dot products only.
-    along = points @ bone.T - (start * bone).sum(1)
-    length2 = np.maximum((bone ** 2).sum(1), 1e-12)
+    # |p - (a + t b)|^2 over all bones and points, with t clamped to the bone, from dot products only.
+    along = bone @ points - (start * bone).sum(1, keepdims=True)
+    length2 = np.maximum((bone ** 2).sum(1, keepdims=True), 1e-12)
     t = np.clip(along / length2, 0, 1)
-    from_start2 = (points ** 2).sum(1)[:, None] - 2 * points @ start.T + (start ** 2).sum(1)
-    distance2 = from_start2 - 2 * t * along + t ** 2 * length2
-    return float((distance2.min(axis=1) < (REACH_M / half) ** 2).mean())
+    from_start2 = (points ** 2).sum(0) - 2 * start @ points + (start ** 2).sum(1, keepdims=True)
+    distance2 = from_start2 - t * (2 * along - t * length2)
+    return float((distance2.min(axis=0) < (REACH_M / half) ** 2).mean())

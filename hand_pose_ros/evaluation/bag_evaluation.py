@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
-from contextlib import AbstractContextManager, ExitStack
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from contextlib import AbstractContextManager, ExitStack, closing
 from dataclasses import dataclass, field, replace
 from datetime import timedelta
-from itertools import islice
+from itertools import islice, starmap
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,10 @@ from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.runtime import cores
 from hand_pose_ros.skeleton import Skeleton
 
+_T = TypeVar('_T')
+_R = TypeVar('_R')
+AHEAD = 2
+"""So many images are decoded before their turn."""
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 """Passes items on and shows how far it is; the number is how many there will be."""
 
@@ -64,6 +69,7 @@ def evaluate_bag(path: str | Path, settings: Settings, progress: Progress | None
                  open_sink: OpenSink | None = None) -> Result:
     """Estimate every depth image of a bag; on the CPU twice the same to the last bit.
 
+    While one image is estimated the next ones are read and decoded: more go through a second than `total` tells.
     Of several hands in an image the first one counts, which is the one that has been tracked longest. An image that
     cannot be decoded counts as one without a hand. Where the bag is damaged, what was before it is evaluated. The
     notes of the result tell both.
@@ -84,11 +90,11 @@ def evaluate_bag(path: str | Path, settings: Settings, progress: Progress | None
     with ExitStack() as stack:
         bag = stack.enter_context(DepthBag(path, **settings.bag))
         sink = stack.enter_context(open_sink(estimator.skeleton, estimator.metadata)) if open_sink else None
-        frames: Iterable[tuple[Frame, float]] = _until_damaged(bag, notes)
-        for frame, read in progress(frames, len(bag)) if progress else frames:
-            hands = record.add(frame, read)
+        images = starmap(_Image, _until_damaged(bag, notes))
+        done: Iterable[tuple[_Image, list[HandEstimate]]] = stack.enter_context(closing(_beside(record.add, images)))
+        for image, hands in progress(done, len(bag)) if progress else done:
             if sink:
-                sink.add(frame, hands)
+                sink.add(image.frame, hands)
     rate = len(record.stamps) / (time.perf_counter() - start)
     if record.intrinsics is None:
         raise InputError(f'{path}: there is no depth image to evaluate'
@@ -153,6 +159,21 @@ def read_depths(path: str | Path, rows: Sequence[int], settings: Settings) -> di
     return depths
 
 
+class _Image:
+    """A frame, decoded as far as it can be."""
+
+    def __init__(self, frame: Frame, read: float) -> None:
+        """`read`: the seconds that it took to be read."""
+        self.frame = frame
+        self.error: InputError | None = None
+        start = time.perf_counter()
+        try:
+            self.depth, self.intrinsics = frame.depth, frame.intrinsics
+        except InputError as error:
+            self.error = error
+        self.seconds = {'read': read, 'decode': time.perf_counter() - start}
+
+
 class _Record:
     """What came out of each image, in order."""
 
@@ -164,26 +185,39 @@ class _Record:
         self.failures: list[str] = []
         self.intrinsics: Intrinsics | None = None
 
-    def add(self, frame: Frame, read: float) -> list[HandEstimate]:
-        """Decode an image, estimate its hands, and keep them and the time it took; `read` [s] it took before."""
+    def add(self, image: _Image) -> list[HandEstimate]:
+        """Estimate the hands of an image, and keep them and the time it took."""
         hands: list[HandEstimate] = []
         times: dict[str, float] = {}
         try:
-            begin = time.perf_counter()
-            depth, intrinsics = frame.depth, frame.intrinsics
-            decoded = time.perf_counter()
-            hands = self._estimator(depth, intrinsics)
-            end = time.perf_counter()
-            times = {'read': read, 'decode': decoded - begin, **self._estimator.timings, 'total': read + end - begin}
-            self.intrinsics = self.intrinsics or intrinsics
+            if image.error:
+                raise image.error
+            start = time.perf_counter()
+            hands = self._estimator(image.depth, image.intrinsics)
+            estimated = time.perf_counter() - start
+            times = {**image.seconds, **self._estimator.timings, 'total': sum(image.seconds.values()) + estimated}
+            self.intrinsics = self.intrinsics or image.intrinsics
         except InputError as error:
             self.failures.append(f'image {len(self.stamps) + 1}: {error}')
         for stage in times.keys() | self.seconds.keys():
             self.seconds.setdefault(stage, [np.nan] * len(self.stamps)).append(times.get(stage, np.nan))
-        self.stamps.append(frame.stamp_ns)
+        self.stamps.append(image.frame.stamp_ns)
         self.joints.append(hands[0].joints.astype(np.float64) if hands
                            else np.full((len(self._estimator.skeleton), 3), np.nan))
         return hands
+
+
+def _beside(work: Callable[[_T], _R], items: Iterable[_T]) -> Generator[tuple[_T, _R]]:
+    """Each item and what becomes of it, in order; the work is done in a thread while the next items are made."""
+    with ThreadPoolExecutor(1) as worker:
+        pending: deque[tuple[_T, Future[_R]]] = deque()
+        for item in items:
+            pending.append((item, worker.submit(work, item)))
+            if len(pending) > AHEAD:
+                item, result = pending.popleft()
+                yield item, result.result()
+        for item, result in pending:
+            yield item, result.result()
 
 
 def _until_damaged(frames: Iterable[Frame], notes: list[str]) -> Iterator[tuple[Frame, float]]:

@@ -97,9 +97,9 @@ def overlay(depth: NDArray[np.float32], intrinsics: Intrinsics, hands: Sequence[
     panels = [picture]
     for hand in hands:
         panels.append(close_up(depth, intrinsics, hand.cube, hand.joints, skeleton, height))
-        _write(panels[-1], f'{hand.side} {hand.score:.2f}')
+        caption(panels[-1], f'{hand.side} {hand.score:.2f}')
     if not hands:
-        _write(picture, 'no hand')
+        caption(picture, 'no hand')
     return np.hstack(panels)
 
 
@@ -165,7 +165,8 @@ def _dot(picture: Picture, center: NDArray[np.float64], radius: float, color: tu
     cv2.circle(picture, _fixed(center), round(radius * (1 << _SHIFT)), color, -1, cv2.LINE_AA, _SHIFT)
 
 
-def _write(picture: Picture, text: str) -> None:
+def caption(picture: Picture, text: str) -> None:
+    """Write into the upper left corner of a picture."""
     around = [((x, y), (0, 0, 0)) for x in (-1, 0, 1) for y in (-1, 0, 1)]  # a thick outline has wider letters
     for (x, y), color in (*around, ((0, 0), (255, 255, 255))):
         cv2.putText(picture, text, (10 + x, 24 + y), cv2.FONT_HERSHEY_SIMPLEX, 0.7, color, 1, cv2.LINE_AA)

@@ -53,7 +53,7 @@ class Intrinsics:
         Raises:
             InputError: K is zero (an uncalibrated camera) or the size is empty.
         """
-        k, p = list(info.k), list(info.p)
+        k, p = [*map(float, info.k)], [*map(float, info.p)]
         fx, fy, cx, cy = (p[0], p[5], p[2], p[6]) if rectified and p[0] != 0 else (k[0], k[4], k[2], k[5])
         if fx == 0:
             raise InputError(
@@ -77,8 +77,8 @@ class Intrinsics:
         for focal, center, size in ((self.fx, self.cx, self.width), (self.fy, self.cy, self.height)):
             if max(abs(center), abs(size - center)) > MAX_SLOPE * focal or size < MIN_SLOPE * focal:
                 raise InputError(f'a focal length of {focal:g} and a principal point at {center:g} pixels are those of '
-                                 f'no camera of {self.width}x{self.height} pixels: calibrate it, or give the '
-                                 'intrinsics fx, fy, cx and cy yourself')
+                                 f'no camera of {self.width}x{self.height} pixels: calibrate it, or correct '
+                                 'the intrinsics that were given')
 
     def project(self, points: ArrayLike) -> NDArray[np.float64]:
         """Points (..., 3) in metres -> pixels (..., 2)."""

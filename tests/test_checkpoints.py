@@ -133,6 +133,11 @@ def test_a_header_whose_length_looks_like_a_pickle_is_none(tmp_path):
     save_checkpoint(path, network, {**METADATA, 'note': 'x' * missing})
     assert path.read_bytes()[:1] == b'\x80'
     assert load_checkpoint(path).metadata['note'] == 'x' * missing
+    data = bytearray(path.read_bytes())
+    data[8:40] = bytes(32)
+    path.write_bytes(data)
+    with pytest.raises(CheckpointError, match='damaged'):
+        load_checkpoint(path)
 
 
 @pytest.mark.parametrize('damage', [

@@ -166,7 +166,7 @@ def test_nothing_usable_writes_nothing(tmp_path, command, capsys):
     (tmp_path / 'frames/0.png').write_text('no picture')
     assert command(tmp_path / 'frames', *INTRINSICS, '--out', tmp_path / 'joints.mcap') == 1
     assert not (tmp_path / 'joints.mcap').exists()
-    assert 'none of the images could be used' in capsys.readouterr().err
+    assert 'none of the images (1) could be used' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize('args', [
@@ -178,6 +178,21 @@ def test_bad_arguments_exit_with_2(folder, command, args):
     with pytest.raises(SystemExit) as leaving:
         command(folder, *args)
     assert leaving.value.code == 2
+
+
+def test_what_is_wrong_with_every_image_is_said_once(tmp_path, command, capsys):
+    with BagWriter(tmp_path / 'bag.mcap') as writer:
+        for stamp in STAMPS:
+            writer.write_depth(stamp, 'camera', np.ones((120, 160), np.float32), CAMERA)
+    assert command(tmp_path / 'bag.mcap', '--intrinsics', 140, 140, 8000, 60, '--out', tmp_path / 'joints.npz') == 1
+    said = capsys.readouterr().err
+    assert said.count('those of no camera') == 1 and f'none of the images ({len(STAMPS)})' in said
+
+
+def test_intrinsics_that_cannot_be_are_refused_at_once(folder, tmp_path, command, capsys):
+    assert command(folder, '--intrinsics', 0, 140, 80, 60, '--out', tmp_path / 'joints.npz') == 1
+    said = capsys.readouterr().err
+    assert '--intrinsics: ' in said and 'must be positive' in said
 
 
 def test_where_nothing_can_be_written_is_said(tmp_path, folder, command, capsys):

@@ -386,6 +386,17 @@ def test_arguments_that_ros_cannot_read_are_one_sentence(arguments: tuple[str, .
     done = subprocess.run([*COMMAND, 'estimator', '--ros-args', *arguments], capture_output=True, text=True)
     assert done.returncode == 1
     assert 'the arguments of ROS cannot be used' in done.stderr and 'Traceback' not in done.stderr
+    assert '.c:' not in done.stderr.rpartition('cannot be used')[2]
+
+
+@pytest.mark.parametrize(('value', 'sentence'), [
+    ('min_score:=1', 'parameter min_score is 1: give a number with a point, as 1.0, from 0 to 1'),
+    ('min_score:=1.5', 'parameter min_score is 1.5: give a number with a point, as 1.0, from 0 to 1'),
+    ('max_hands:=two', "parameter max_hands is 'two': give a whole number from 1 to 8"),
+    ('tracking:=1', 'parameter tracking is 1: give true or false')])
+def test_a_parameter_of_another_kind_is_one_sentence(value: str, sentence: str) -> None:
+    done = subprocess.run([*COMMAND, 'estimator', '--ros-args', '-p', value], capture_output=True, text=True)
+    assert done.returncode == 1 and sentence in done.stderr and 'Traceback' not in done.stderr
 
 
 def test_smoothing_holds_a_hand_still_that_jumps(rig: Rig) -> None:

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 
+from hand_pose_ros.bags import DepthBag
 from hand_pose_ros.cli import main
 from hand_pose_ros.detection import detect
 from hand_pose_ros.geometry import Cube, Intrinsics
@@ -241,6 +242,9 @@ def test_command_line_shows_writes_and_measures(tmp_path, capsys, shared_data):
     picture = cv2.imread(str(sheet))
     assert picture is not None and picture.std() > 20
 
+    assert main(['synth', 'record', str(tmp_path / 'raw.mcap'), '--number', '2', '--raw']) == 0
+    with DepthBag(tmp_path / 'raw.mcap') as bag:
+        assert bag.depth_topic == '/depth/image_rect' and len(bag) == 2
     assert main(['synth', 'write', str(tmp_path / 'data'), '--number', '5', '--shard', '3', '--split', 'val']) == 0
     shards = sorted((tmp_path / 'data').iterdir())
     assert [shard.name for shard in shards] == ['val_000000000.npz', 'val_000000003.npz']

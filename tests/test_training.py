@@ -322,6 +322,13 @@ def test_training_learns_and_leaves_a_folder_that_tells_all(folder, tmp_path):
         tiny(folder, out=tmp_path).train()
 
 
+def test_a_run_that_is_there_is_not_trained_over(tmp_path, capsys):
+    (tmp_path / 'state.safetensors').touch()
+    assert main(['train', 'paper', '--out', str(tmp_path), '--cache', str(tmp_path / 'cache')]) == 1
+    assert f'{tmp_path} holds a run already' in capsys.readouterr().err
+    assert not (tmp_path / 'cache').exists(), 'samples were made for nothing'
+
+
 def test_the_prior_comes_from_the_training_poses_and_is_trained_on_unless_the_recipe_says_no(folder, tmp_path):
     for recipe, trained_on in (('paper', True), ('original-code', False)):
         run = tiny(folder, 'samples=16', 'augmentation=none', recipe=recipe, out=tmp_path / recipe)

@@ -143,7 +143,8 @@ class DepthBag(Bag):
     def _on_topic(self, topic: str, types: Sequence[str], remedy: str) -> list[Connection]:
         found = [c for c in self.connections if c.topic == topic and c.msgtype in types and c.msgcount]
         if not found:
-            raise InputError(f'{self.path}: there is no {_ros_name(types[0])} on {topic}: give {remedy} '
+            kinds = ' or '.join(map(_ros_name, types))
+            raise InputError(f'{self.path}: there is no {kinds} on {topic}: give {remedy} '
                              f'(the bag has {self._topics()})')
         return found
 

@@ -6,6 +6,7 @@ import argparse
 import os
 import sys
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -145,4 +146,9 @@ def _check_fits(checkpoint: Checkpoint, name: str) -> None:
 
 def _progress(what: str) -> Progress:
     from tqdm import tqdm
-    return lambda items, total: tqdm(items, what, total, disable=None)
+
+    def progress(items: Iterable[Any], total: int) -> Iterable[Any]:
+        if not sys.stderr.isatty():
+            print(f'{what}: {total} ...', file=sys.stderr, flush=True)
+        return tqdm(items, what, total, disable=None)
+    return progress

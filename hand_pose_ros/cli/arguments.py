@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from hand_pose_ros.errors import HandPoseError
+from hand_pose_ros.errors import HandPoseError, naming
+from hand_pose_ros.geometry import Intrinsics
 
 
 def count(text: str) -> int:
@@ -52,12 +53,21 @@ def add_bag(parser: Any) -> None:
     parser.add_argument('--depth-topic', metavar='TOPIC', help='needed if several topics carry depth')
     parser.add_argument('--camera-info-topic', metavar='TOPIC', help='if not camera_info beside the depth topic')
     parser.add_argument('--intrinsics', nargs=4, type=float, metavar=('FX', 'FY', 'CX', 'CY'),
-                        help='of the camera in pixels, instead of those of camera_info (or of the dataset)')
+                        help='of the camera in pixels, instead of those of camera_info; PNGs have no others')
     parser.add_argument('--depth-scale', type=metres, metavar='M', help='metres per unit of 16-bit depth (0.001)')
+
+
+def check_intrinsics(args: argparse.Namespace) -> None:
+    """Refuse --intrinsics that are those of no camera, before any work."""
+    if args.intrinsics:
+        with naming('--intrinsics'):
+            fx, fy, cx, cy = args.intrinsics
+            Intrinsics(fx, fy, cx, cy, width=1, height=1)
 
 
 def bag_options(args: argparse.Namespace) -> dict[str, Any]:
     """For `DepthBag`."""
+    check_intrinsics(args)
     return {'depth_topic': args.depth_topic, 'camera_info_topic': args.camera_info_topic,
             'intrinsics': args.intrinsics and tuple(args.intrinsics), 'depth_scale': args.depth_scale}
 

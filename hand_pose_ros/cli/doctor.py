@@ -150,7 +150,8 @@ def _dds_profile() -> Findings:
             yield 'WRONG', f'{other} is set, which this ROS does not read: name it {variable}'
         yield 'note', (f'none: who publishes images from this shell has a shared-memory segment of '
                        f'{DEFAULT_SEGMENT // 1024} kB, into which a VGA depth image ({VGA_IMAGE // 1000} kB) does not '
-                       f'fit; start the camera driver with {variable}={ours} (replay and demo do so themselves)')
+                       f'fit; before the camera driver starts: export {variable}={ours} (replay and demo do so '
+                       'themselves)')
     else:
         try:
             segment = segment_size(Path(given))

@@ -18,7 +18,15 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from hand_pose_ros.bags import DepthBag
-from hand_pose_ros.cli.arguments import add_bag, add_estimator, bag_options, count, estimator_options, keep_input
+from hand_pose_ros.cli.arguments import (
+    add_bag,
+    add_estimator,
+    bag_options,
+    check_intrinsics,
+    count,
+    estimator_options,
+    keep_input,
+)
 from hand_pose_ros.cli.hand_bag import HandBag
 from hand_pose_ros.depth import depth_problem, read_png
 from hand_pose_ros.drawing import overlay
@@ -66,6 +74,8 @@ def run(args: argparse.Namespace) -> int:
         args.parser.error(f'--out {args.out}: the name must end in .npz or .mcap')
     if not args.out and not args.overlay:
         args.parser.error('say what to write: --out FILE, --overlay FOLDER, or both')
+    if not args.input.exists():
+        raise InputError(f'{args.input}: there is no such bag, PNG or folder: check the path')
     keep_input(args.out, args.input)
     keep_input(args.overlay, args.input.parent if args.input.suffix.lower() == '.png' else args.input)
     with ExitStack() as stack:
@@ -107,7 +117,7 @@ class _Sink(Protocol):
 def estimate(images: Iterator[DepthInput], count: int, estimator: HandPoseEstimator, sinks: Sequence[_Sink]) -> int:
     """Run the estimator over all images and feed the sinks; an image that cannot be used is reported and left out."""
     done = found = failed = 0
-    problem = ''
+    problem, said = '', ''
     seconds: list[float] = []
     for image in tqdm(images, total=count, unit='image', disable=None):
         try:
@@ -117,7 +127,9 @@ def estimate(images: Iterator[DepthInput], count: int, estimator: HandPoseEstima
             seconds.append(time.perf_counter() - start)
         except InputError as error:
             failed += 1
-            tqdm.write(f'hand-pose estimate: {error}', file=sys.stderr)
+            if str(error) != said:  # mostly the same is wrong with all
+                tqdm.write(f'hand-pose estimate: {error}', file=sys.stderr)
+            said = str(error)
             continue
         done += 1
         found += bool(hands)
@@ -125,7 +137,7 @@ def estimate(images: Iterator[DepthInput], count: int, estimator: HandPoseEstima
         for sink in sinks:
             sink.add(image, depth, intrinsics, hands)
     if not done:
-        raise InputError('none of the images could be used, so nothing was written')
+        raise InputError(f'none of the images ({failed}) could be used, so nothing was written')
     for sink in sinks:
         sink.finish()
     print(f'{done} image{"s" if done > 1 else ""}, {found} with a hand, {failed} that could not be used; '
@@ -146,6 +158,7 @@ def _open(args: argparse.Namespace, stack: ExitStack) -> tuple[Iterator[DepthInp
     if paths:
         if args.intrinsics is None:
             args.parser.error('PNGs come without a camera: give --intrinsics FX FY CX CY')
+        check_intrinsics(args)
         return _from_pngs(paths, args.intrinsics, args.depth_scale or 0.001), len(paths)
     bag = stack.enter_context(DepthBag(args.input, **bag_options(args)))
     return _from_bag(bag), len(bag)

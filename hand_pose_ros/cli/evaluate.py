@@ -239,8 +239,9 @@ def print_summaries(summaries: Iterable[tuple[str, dict[str, Any]]]) -> None:
         if 'latency_ms' not in summary:
             continue
         print(f'{name}: {summary["frames_total"]} frames, {number(summary["detection_rate"], 1, " %", 100)} with a '
-              f'hand, {_pace(summary)}, jitter {number(summary["jitter_mm"], 2, " mm")}, '
-              f'bone drift {number(summary["bone_drift_mm"], 2, " mm")}')
+              f'hand, {_pace(summary)}' + ('' if 'mean_mm' in summary else  # which is in the table
+              f', jitter {number(summary["jitter_mm"], 2, " mm")}, '
+              f'bone drift {number(summary["bone_drift_mm"], 2, " mm")}'))
         keys = ('mean', 'p50', 'p90', 'p99', 'max')
         print(text_table(('ms', *keys), [(stage, *(number(row.get(key), 3) for key in keys))
                                          for stage, row in summary['latency_ms'].items()]))

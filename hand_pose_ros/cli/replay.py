@@ -54,6 +54,7 @@ def run(args: argparse.Namespace) -> int:
 
     with replaying(args.bag, args.ros_args, topics=args.topics, rate=args.rate, reliability=args.qos, clock=args.clock,
                    paused=args.start_paused) as replay:
+        print(f'{args.bag}: publishing {", ".join(sorted(replay.published))}', flush=True)
         try:
             replay.wait_for_subscribers(args.wait)
             replay.play(args.start)

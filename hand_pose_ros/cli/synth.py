@@ -65,6 +65,7 @@ def add_parser(subparsers: Any) -> None:
     record = actions.add_parser('record', parents=[common], help='a bag of one moving hand, with its true joints')
     record.add_argument('out', type=Path, metavar='BAG', help='a .mcap or .db3 file, or the folder of a ROS 2 bag')
     record.add_argument('--number', type=count, default=90, metavar='N', help='images, 30 a second (90)')
+    record.add_argument('--raw', action='store_true', help='depth as sensor_msgs/Image instead of compressedDepth')
 
     stats = actions.add_parser('stats', parents=[common, real], help='numbers of synthetic beside real crops')
     stats.add_argument('--number', type=count, default=512, metavar='N', help='synthetic samples (512)')
@@ -190,7 +191,7 @@ def _record(args: argparse.Namespace) -> None:
             middle = joints.mean(axis=0)
             truth = HandEstimate(joints, HAND21.joint_names, np.ones(len(HAND21), np.float32), 1.0, side,
                                  Cube((float(middle[0]), float(middle[1]), float(middle[2])), 0.3), 'truth')
-            bag.write_depth(stamp, frame, depth, camera)
+            bag.write_depth(stamp, frame, depth, camera, codec=None if args.raw else 'png')
             bag.write_hands(stamp, frame, [truth] if side != 'none' else [], topic='/truth/joints')
     print(f'{args.out}: {args.number} images')
 

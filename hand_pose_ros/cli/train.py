@@ -79,7 +79,10 @@ def run(args: argparse.Namespace) -> int:
     if not args.resume and not args.recipe:
         args.parser.error('give a RECIPE (paper, original-code, modern or finder), or --resume')
     show_progress()
-    recipe = RunFolder(args.out).recipe() if args.resume else get_recipe(args.recipe, args.overrides)
+    folder = RunFolder(args.out)
+    if not args.resume:
+        folder.require_none()  # now, not after the first samples were made
+    recipe = folder.recipe() if args.resume else get_recipe(args.recipe, args.overrides)
     with logging_redirect_tqdm(), process_group(args.device):
         Run(args.out, recipe, machine(args)).train(args.resume)
     return 0

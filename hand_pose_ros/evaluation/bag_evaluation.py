@@ -24,6 +24,7 @@ from hand_pose_ros.estimator import HandEstimate, HandPoseEstimator
 from hand_pose_ros.evaluation.ground_truth import with_truth
 from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.geometry import Intrinsics
+from hand_pose_ros.models.checkpoints import DEFAULT
 from hand_pose_ros.runtime import cores
 from hand_pose_ros.skeleton import Skeleton
 
@@ -107,8 +108,8 @@ def evaluate_bag(path: str | Path, settings: Settings, progress: Progress | None
         name=Path(path).stem, skeleton=estimator.skeleton, intrinsics=record.intrinsics,
         predictions=np.stack(record.joints), stamps_ns=np.array(record.stamps), notes=tuple(notes),
         seconds={stage: np.array(record.seconds[stage]) for stage in sorted(record.seconds, key=_stage_order)},
-        info={'bag': str(path), 'depth_topic': bag.depth_topic, 'model': str(settings.model or 'default'),
-              'device': settings.device, 'frames_per_s': round(rate, 1), 'damaged': damaged})
+        info={'bag': str(path), 'depth_topic': bag.depth_topic, 'model': str(settings.model or DEFAULT),
+              'engine': estimator.engine.name, 'frames_per_s': round(rate, 1), 'damaged': damaged})
     return result if settings.ground_truth is None else with_truth(result, settings.ground_truth, path)
 
 

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hand_pose_ros import __version__
-from hand_pose_ros.drawing import FINGER_COLORS, close_up
+from hand_pose_ros.drawing import FINGER_COLORS, caption, close_up
 from hand_pose_ros.evaluation import metrics, plots
 from hand_pose_ros.evaluation.published import DATASETS
 from hand_pose_ros.evaluation.results import Result
@@ -114,8 +114,11 @@ def _cards(result: Result, read_depths: ReadDepths | None) -> list[_Card]:
         depth = depths.get(row)
         picture, kind = '', 'blind'
         if depth is not None:
-            panels = [close_up(depth, result.intrinsics, cube, joints, result.skeleton)
-                      for joints in (estimate, truth) if np.isfinite(joints).all()]
+            panels = []
+            for name, joints in (('estimate', estimate), ('truth', truth)):
+                if np.isfinite(joints).all():
+                    panels.append(close_up(depth, result.intrinsics, cube, joints, result.skeleton))
+                    caption(panels[-1], name)
             kind = '' if len(panels) == 2 else 'single'
             picture = _data_image('png', cv2.imencode('.png', np.hstack(panels))[1].tobytes(),
                                   'joints on the depth image: estimate' + (', truth' if len(panels) > 1 else ''))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
@@ -115,9 +116,9 @@ def _locate(name_or_path: str | PathLike[str]) -> Path:
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     with open(path, 'rb') as file:
         start = file.read(9)
-    # A pickle, or a zip around one (torch.save). A safetensors file may begin with the same byte, as it begins with a
-    # length; but then comes its header.
-    if start[8:] != b'{' and (start[:1] == b'\x80' or start[:4] == b'PK\x03\x04'):
+    # A pickle with its protocol, or a zip around one (torch.save). A safetensors file may begin with the same bytes, as
+    # it begins with a length; but then comes its header.
+    if start[8:] != b'{' and re.match(rb'\x80[\x02-\x05]|PK\x03\x04', start):
         raise CheckpointError(f'{path} is a pickle, which can run code when read: give a .safetensors file')
     try:
         with safe_open(path, framework='pt') as file:

@@ -6,6 +6,7 @@ Callbacks only store and signal. One worker thread takes the newest image throug
 from __future__ import annotations
 
 import gc
+import re
 import sys
 import time
 import traceback
@@ -18,7 +19,6 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from numpy.typing import NDArray
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
-from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
@@ -303,7 +303,8 @@ def main(args: list[str] | None = None) -> int:
     try:
         rclpy.init(args=args)
     except RuntimeError as error:  # RCLError, which rclpy keeps to itself
-        raise HandPoseError(f'the arguments of ROS cannot be used: {str(error).splitlines()[0]}') from error
+        reason = re.sub(r', at /\S+:\d+', '', str(error).splitlines()[0])  # of the file in C
+        raise HandPoseError(f'the arguments of ROS cannot be used: {reason}') from error
     executor, node = SingleThreadedExecutor(), None
     try:
         node = EstimatorNode()
@@ -311,8 +312,6 @@ def main(args: list[str] | None = None) -> int:
         executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
-    except ParameterException as error:
-        raise HandPoseError(f'{error}: check the command line and the parameter file') from error
     finally:
         if node is not None:
             node.destroy_node()

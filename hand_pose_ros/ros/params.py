@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -137,20 +138,34 @@ def declare(node: Node) -> Params:
     """Declare all parameters on a node, and read them.
 
     Raises:
-        HandPoseError: two values contradict each other, or one is not among the choices.
-        rclpy.exceptions.ParameterException: a value of another type, or out of range.
+        HandPoseError: a value of another type, out of range or not among the choices, or two that contradict each
+            other.
     """
-    values = {row.name: node.declare_parameter(ros_name(row), row.default, _descriptor(row)).value
-              for row in fields(Params)}
-    return Params(**values)
+    return Params(**{row.name: _declare(node, row) for row in fields(Params)})
+
+
+def _declare(node: Node, row: Any) -> Any:
+    name, low = ros_name(row), row.metadata['low']
+    try:
+        return node.declare_parameter(name, row.default, _descriptor(row)).value
+    except ParameterException as error:
+        given = _overrides(node)[name].value
+        wanted = {bool: 'true or false', int: 'a whole number', float: 'a number with a point, as 1.0,',
+                  str: 'a text'}[type(row.default)]
+        span = '' if low is None else f' from {low:g} to {row.metadata["high"]:g}'
+        raise HandPoseError(f'parameter {name} is {given!r:.80}: give {wanted}{span}') from error
 
 
 def unknown(node: Node) -> list[str]:
     """Names of parameters that were given at start and are none of ours, nor any that rclpy declares later."""
     ours = {ros_name(row) for row in fields(Params)}
-    given = getattr(node, '_parameter_overrides', {})  # rclpy tells nobody
-    return [name for name in given if name not in ours and name != 'use_sim_time' and not name.startswith('qos_')
-            and not name.startswith('start_type_description_service')]
+    return [name for name in _overrides(node) if name not in ours and name != 'use_sim_time'
+            and not name.startswith('qos_') and not name.startswith('start_type_description_service')]
+
+
+def _overrides(node: Node) -> dict[str, Parameter]:
+    """What was given at start; rclpy tells nobody."""
+    return getattr(node, '_parameter_overrides', {})
 
 
 def changed(params: Params, changes: Sequence[Parameter], *, configured: bool) -> Params:

@@ -47,14 +47,18 @@ class RunFolder:
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise TrainingError(f'{self.path} holds no run to resume ({error})') from error
 
+    def require_none(self) -> None:
+        """Raise TrainingError if the folder holds a run already."""
+        if self.state.exists():
+            raise TrainingError(f'{self.path} holds a run already: continue it with --resume, or choose another --out')
+
     def create(self, recipe: Recipe) -> None:
         """Start a new run here.
 
         Raises:
             TrainingError: the folder holds a run already.
         """
-        if self.state.exists():
-            raise TrainingError(f'{self.path} holds a run already: continue it with --resume, or choose another --out')
+        self.require_none()
         self.path.mkdir(parents=True, exist_ok=True)
         write_json(self.path / 'config.json', {'recipe': recipe_to_dict(recipe), 'git': _git_revision()})
 

@@ -222,8 +222,9 @@ class Run:
                 self._save()
                 if self.rank == 0 and self._validated < self.step:
                     self._save_checkpoint('last', {})
-                raise TrainingError(f'stopped by a signal after {self.step * self.recipe.batch_size:,} samples; '
-                                    'continue with --resume (an experiment: with the same command)') from None
+                raise TrainingError(f'stopped by a signal after {self.step * self.recipe.batch_size:,} samples, with '
+                                    f"weights in {self.folder.checkpoint('last')}; continue with --resume (an "
+                                    'experiment: with the same command)') from None
             finally:
                 self.shards.close()
                 self.folder.close()

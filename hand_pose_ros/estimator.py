@@ -10,7 +10,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import count
 from os import PathLike
 from typing import Any, Literal
@@ -188,7 +188,8 @@ class HandPoseEstimator:
         self._last_s = time_s
 
         hands: list[HandEstimate] = []
-        for track in list(self._tracks):
+        tracks, self._tracks = self._tracks, []  # whatever goes wrong with one, it is not met again
+        for track in tracks:
             usual = self.cube_side == self.metadata.get('cube_side')  # another was chosen with a hand in mind
             cube = Cube(track.center, self.cube_side * (track.scale if usual else 1))
             with self._timed('detect'):
@@ -197,9 +198,8 @@ class HandPoseEstimator:
                     max_through=1 if 'hand' in self.engine.outputs else MAX_THROUGH)
             reading = self._read(depth, intrinsics, cube, track) if alive else None
             if reading is not None and reading.score >= self.min_score and not _overlaps(reading.cube, hands):
+                self._tracks.append(track)
                 hands.append(self._follow(track, reading, dt))
-            else:
-                self._tracks.remove(track)
         self._find(depth, intrinsics, hands, dt, regions)
         if not self.tracking:
             self._tracks.clear()
@@ -256,7 +256,8 @@ class HandPoseEstimator:
                     or reading.score < hopeless):
                 break
             reading = self._predict(depth, intrinsics, Cube(tuple(center.tolist()), cube.side), track)
-        return reading
+        # Joints that are not in front of the camera are no hand, whatever the network thinks of them.
+        return reading if reading.joints[:, 2].mean() > 0 else replace(reading, score=-1.0)
 
     def _predict(self, depth: NDArray[np.float32], intrinsics: Intrinsics, cube: Cube, track: _Track) -> _Reading:
         with self._timed('crop'):

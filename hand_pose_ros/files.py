@@ -20,6 +20,8 @@ def in_one_step(path: str | Path) -> Iterator[Path]:
         InputError: the folder cannot be made or written.
     """
     path = Path(path)
+    if path.is_dir():
+        raise InputError(f'{path}: is a folder: give the name of a file')
     part = path.with_name(f'.{path.name}.{os.getpid()}.part')
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -155,6 +155,19 @@ def test_a_camera_info_of_another_size_is_refused_for_its_frame(tmp_path, depths
         _ = frame.intrinsics
 
 
+@pytest.mark.parametrize('empty', [0, 5])
+def test_a_camera_info_that_is_empty_is_passed_over(tmp_path, depths, empty):
+    with BagWriter(tmp_path / 'bag.mcap') as bag:
+        for i, (stamp, depth) in enumerate(zip(STAMPS, depths, strict=True)):
+            camera = CAMERA if i != empty else SimpleNamespace(fx=0.0, fy=0.0, cx=0.0, cy=0.0, width=64, height=48)
+            bag.write_depth(stamp, 'camera_optical', depth, camera, codec=None)
+    if empty:
+        assert_same(tmp_path / 'bag.mcap', depths)
+    else:  # as long as there has been no other, the camera is unknown
+        with DepthBag(tmp_path / 'bag.mcap') as bag, pytest.raises(InputError, match='not calibrated.*--intrinsics'):
+            list(bag)
+
+
 def test_the_newest_camera_info_counts(tmp_path, depths):
     zoomed = Intrinsics(600, 600, 31.5, 23.5, 64, 48)
     with BagWriter(tmp_path / 'zoom.mcap') as bag:

@@ -10,8 +10,9 @@ import pytest
 
 from hand_pose_ros.errors import CheckpointError, InputError
 from hand_pose_ros.estimator import HandPoseEstimator
-from hand_pose_ros.geometry import Intrinsics
+from hand_pose_ros.geometry import Cube, Intrinsics
 from hand_pose_ros.models.checkpoints import DEFAULT, available
+from hand_pose_ros.skeleton import HAND21
 from hand_pose_ros.synthetic.generator import SyntheticHands
 
 KINECT2 = Intrinsics(363.9, 363.9, 255.4, 206.3, 512, 424)
@@ -52,6 +53,18 @@ def test_joints_are_metric_and_where_the_hand_is(estimator, sequence):
         [hand] = estimator(frame.depth, frame.intrinsics)
         errors.append(np.linalg.norm(hand.joints - frame.joints, axis=1))
     assert np.median(errors) < 0.025
+
+
+def test_a_hand_behind_the_camera_is_none_and_does_not_last():
+    answers = iter([-0.95, 0.0, 0.0])
+    engine = SimpleNamespace(outputs=('joints', 'confidence', 'hand', 'side'), run_full=lambda patches: {
+        'joints': np.full((len(patches), 21, 3), (0, 0, next(answers, 0.0)), np.float32),
+        'confidence': np.full((len(patches), 21), 9.0, np.float32), 'hand': np.full(len(patches), 9.0, np.float32),
+        'side': np.zeros(len(patches), np.float32)})
+    estimator = HandPoseEstimator(engine, HAND21, find=lambda *_, **__: [Cube((0.0, 0.0, 0.13), 0.3)], min_score=0.0)
+    depth = np.full((424, 512), 0.13, np.float32)
+    assert estimator(depth, KINECT2) == []
+    assert len(estimator(depth, KINECT2)) == 1 and len(estimator(depth, KINECT2)) == 1
 
 
 def test_one_hand_keeps_its_name_until_reset(estimator, sequence):

@@ -13,9 +13,12 @@ import torch
 
 from hand_pose_ros.bags import Bag, BagWriter, read_hands
 from hand_pose_ros.cli import main
+from hand_pose_ros.cli.evaluate import _names
+from hand_pose_ros.errors import InputError
 from hand_pose_ros.estimator import HandEstimate
 from hand_pose_ros.evaluation.bag_evaluation import Settings, evaluate_bag
 from hand_pose_ros.evaluation.results import Result
+from hand_pose_ros.files import in_one_step
 from hand_pose_ros.geometry import Cube, Intrinsics
 from hand_pose_ros.models import build
 from hand_pose_ros.models.checkpoints import save_checkpoint
@@ -237,3 +240,15 @@ def test_the_live_node_answers_what_the_estimator_says(ros_domain, tmp_path, mod
     until = int(np.argmin(answered)) if got['dropped'] else 8
     assert live[:until] == pytest.approx(evaluate_bag(bag, settings).predictions[:until], abs=1e-5)
     assert 0 < got['latency_ms']['image to joints']['p50'] < 2000
+
+
+def test_bags_of_one_name_get_names_of_their_own():
+    bags = ['x.mcap', '../x.mcap', 'a/b/x.mcap', 'a_b/x.mcap', 'y.mcap']
+    names = _names(bags)
+    assert names['y.mcap'] == 'y' and len(set(names.values())) == len(bags)
+
+
+def test_a_folder_where_a_file_is_to_be_is_refused(tmp_path):
+    with pytest.raises(InputError, match='is a folder'), in_one_step(tmp_path):
+        pass
+    assert not list(tmp_path.parent.glob('.*.part'))

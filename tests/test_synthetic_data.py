@@ -241,6 +241,8 @@ def test_command_line_shows_writes_and_measures(tmp_path, capsys, shared_data):
                  *real]) == 0
     picture = cv2.imread(str(sheet))
     assert picture is not None and picture.std() > 20
+    assert main(['synth', 'show', str(tmp_path / 'new' / 'sheet.png'), '--number', '1']) == 0
+    assert (tmp_path / 'new' / 'sheet.png').exists()
 
     assert main(['synth', 'record', str(tmp_path / 'raw.mcap'), '--number', '2', '--raw']) == 0
     with DepthBag(tmp_path / 'raw.mcap') as bag:

@@ -88,6 +88,7 @@ class DepthBag(Bag):
             raise
         self._intrinsics = intrinsics or ()
         self._depth_scale = 0.001 if depth_scale is None else depth_scale
+        self._unusable = ''
 
     def __len__(self) -> int:
         """How many depth images there are."""
@@ -110,6 +111,8 @@ class DepthBag(Bag):
                     self._remember(connection, message, cameras)
                     continue
                 header = message.header
+                if not cameras and not self._intrinsics:
+                    raise InputError(self._unusable)
                 camera = self._intrinsics if not cameras else cameras.get(header.frame_id, cameras[''])
                 yield Frame(_stamp_ns(header), header.frame_id, self.depth_topic, message, camera, self._depth_scale)
                 count += 1
@@ -120,8 +123,10 @@ class DepthBag(Bag):
         """Keep the intrinsics as the newest of their frame_id, and as the newest of all under ''."""
         if self.is_ros1:  # K, D, R and P became lower-case in ROS 2
             info = SimpleNamespace(**{name.lower(): value for name, value in vars(info).items()})
-        with naming(f'{self.path}: {connection.topic}'):
+        try:
             cameras[info.header.frame_id] = cameras[''] = Intrinsics.from_camera_info(info)
+        except InputError as error:  # some drivers begin with one that is empty
+            self._unusable = f'{self.path}: {connection.topic}: {error}; or give --intrinsics FX FY CX CY'
 
     def _find_depth_topic(self) -> str:
         depth = {connection.topic for connection in self.connections if self._carries_depth(connection)}

@@ -125,9 +125,9 @@ class BagWriter:
 
     def close(self) -> None:
         """Complete the bag and move it into place."""
-        self._writer.close()
         made = self._writer.path
         try:
+            self._writer.close()
             os.replace(next(made.glob(f'*{self.path.suffix}')) if self._is_file else made, self.path)
         finally:
             shutil.rmtree(self._work, ignore_errors=True)

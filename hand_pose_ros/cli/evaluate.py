@@ -83,8 +83,8 @@ def run(args: argparse.Namespace) -> int:
             if getattr(args, name) not in (None, False, 'auto', 'network'):
                 args.error(f'--{name.replace("_", "-")} is for bags: crops, sides and truth are those of the benchmark')
         from hand_pose_ros.evaluation.benchmark_evaluation import evaluate_benchmark
-        result = evaluate_benchmark(args.model, args.device, progress=_progress('batches'))
-        _deliver(args, result, [published.load_result(source) for source in args.compare], None)
+        others = [published.load_result(source) for source in args.compare]
+        _deliver(args, evaluate_benchmark(args.model, args.device, progress=_progress('batches')), others, None)
         return 0
     return _run_bag(args) if len(args.bags) == 1 else _run_bags(args)
 
@@ -119,11 +119,11 @@ def _run_bag(args: argparse.Namespace) -> int:
     from hand_pose_ros.evaluation.bag_evaluation import evaluate_bag, read_depths
 
     keep_input(args.out_bag, args.bags[0])
+    others = [published.load_result(source) for source in args.compare]  # before the work, for they may be missing
     settings = _settings(args)
     sink = partial(HandBag, args.out_bag) if args.out_bag else None
     result = _evaluate_live(args, settings) if args.via_ros else \
         evaluate_bag(args.bags[0], settings, _progress('frames'), sink)
-    others = [published.load_result(source) for source in args.compare]
     _deliver(args, result, others, lambda rows: read_depths(args.bags[0], rows, settings))
     return int(result.info['damaged'])
 
@@ -207,8 +207,12 @@ def _settings(args: argparse.Namespace) -> Settings:
 def _names(bags: Sequence[str]) -> dict[str, str]:
     """A short name for each bag, which no other has."""
     stems = [Path(bag).stem for bag in bags]
-    return {bag: stem if stems.count(stem) == 1 else '_'.join(Path(bag).parts).strip('/\\_.')
-            for bag, stem in zip(bags, stems, strict=True)}
+    names: dict[str, str] = {}
+    for bag, stem in zip(bags, stems, strict=True):
+        name = stem if stems.count(stem) == 1 else '_'.join(Path(bag).parts).strip('/\\_.')
+        taken = sum(other == name or other.startswith(f'{name}-') for other in names.values())
+        names[bag] = f'{name}-{taken + 1}' if taken else name
+    return names
 
 
 def _deliver(args: argparse.Namespace, result: Result, others: Sequence[Result],

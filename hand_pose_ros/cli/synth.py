@@ -104,6 +104,7 @@ def _show(args: argparse.Namespace) -> None:
     import torch
 
     from hand_pose_ros.drawing import contact_sheet
+    from hand_pose_ros.files import write_bytes
     from hand_pose_ros.synthetic.generator import LEFT
     from hand_pose_ros.synthetic.sensors import SENSORS
     from hand_pose_ros.synthetic.stages import Ingredients
@@ -127,7 +128,8 @@ def _show(args: argparse.Namespace) -> None:
             if args.joints and side != 'none':
                 _draw_joints(picture, batch['joints'][i].numpy(), batch['visible'][i].numpy())
             pictures.append(picture)
-    cv2.imwrite(str(args.out), contact_sheet(pictures, columns=min(_COLUMNS, number)))
+    sheet = contact_sheet(pictures, columns=min(_COLUMNS, number))
+    write_bytes(args.out, cv2.imencode(args.out.suffix, sheet)[1].tobytes())
     print(f'{args.out}: {len(pictures)} pictures')
 
 

@@ -111,7 +111,7 @@ def center_of_mass_cube(depth: NDArray[np.float32], seed: Cube, intrinsics: Intr
     (u, v), reach_u, reach_v = intrinsics.project(seed.center), intrinsics.fx * half / z, intrinsics.fy * half / z
     top, left = max(0, round(v - reach_v)), max(0, round(u - reach_u))
     window = depth[top:max(0, round(v + reach_v)), left:max(0, round(u + reach_u))]
-    rows, columns = np.nonzero((window > z - half) & (window < z + half))
+    rows, columns = np.nonzero((window > max(z - half, 0)) & (window < z + half))
     if not len(rows):
         return seed
     center = intrinsics.back_project((columns.mean() + left, rows.mean() + top), window[rows, columns].mean())

@@ -150,7 +150,7 @@ def _interesting_frames(result: Result) -> list[tuple[str, int]]:
 def _cloud(depth: Depth, intrinsics: Intrinsics, cube: Cube) -> list[int]:
     """Points of the surface within the cube, x y z x y z .. in whole millimetres from its centre."""
     half = cube.side / 2
-    v, u = np.nonzero((depth > cube.center[2] - half) & (depth < cube.center[2] + half))
+    v, u = np.nonzero((depth > max(cube.center[2] - half, 0)) & (depth < cube.center[2] + half))
     points = intrinsics.back_project(np.stack([u, v], -1), depth[v, u]) - np.array(cube.center)
     points = points[(np.abs(points) < half).all(-1)]
     return np.rint(1000 * points[::max(1, len(points) // _CLOUD_POINTS)]).astype(int).ravel().tolist()

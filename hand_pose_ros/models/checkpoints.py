@@ -114,8 +114,11 @@ def _locate(name_or_path: str | PathLike[str]) -> Path:
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    with open(path, 'rb') as file:
-        start = file.read(9)
+    try:
+        with open(path, 'rb') as file:
+            start = file.read(9)
+    except OSError as error:
+        raise CheckpointError(f'checkpoint {path} cannot be read ({error.strerror}): check its permissions') from error
     # A pickle with its protocol, or a zip around one (torch.save). A safetensors file may begin with the same bytes, as
     # it begins with a length; but then comes its header.
     if start[8:] != b'{' and re.match(rb'\x80[\x02-\x05]|PK\x03\x04', start):

@@ -1,9 +1,12 @@
 """The ROS 2 side: the only room that imports rclpy or messages."""
 
+import re
+from typing import Any
+
 from hand_pose_ros.errors import HandPoseError
 
 try:
-    import rclpy  # noqa: F401
+    import rclpy
 except ImportError as error:
     raise HandPoseError(
         'ROS 2 is not available to this Python (no module rclpy): source the setup file of your ROS installation, or '
@@ -14,3 +17,16 @@ except ImportError as error:
     raise HandPoseError(
         'the messages of hand_pose_ros are not built for this Python: build the package with colcon build and source '
         'its setup file, or install it again with pip where ROS is available') from error
+
+
+def init(args: list[str] | None = None, **options: Any) -> None:
+    """rclpy.init, whose arguments may be wrong.
+
+    Raises:
+        HandPoseError: the arguments of ROS cannot be used.
+    """
+    try:
+        rclpy.init(args=args, **options)
+    except RuntimeError as error:  # RCLError, which rclpy keeps to itself
+        reason = re.sub(r', at /\S+:\d+', '', str(error).splitlines()[0])  # of the file in C
+        raise HandPoseError(f'the arguments of ROS cannot be used: {reason}') from error

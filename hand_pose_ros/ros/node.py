@@ -6,7 +6,6 @@ Callbacks only store and signal. One worker thread takes the newest image throug
 from __future__ import annotations
 
 import gc
-import re
 import sys
 import time
 import traceback
@@ -27,6 +26,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, RegionOfInterest
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
+from hand_pose_ros import ros
 from hand_pose_ros.depth import decode_compressed, decode_image, depth_problem
 from hand_pose_ros.detection import Region
 from hand_pose_ros.errors import HandPoseError
@@ -258,15 +258,16 @@ class EstimatorNode(LifecycleNode):
         """One image in, one answer out. Whatever goes wrong is said, and the next image gets its chance."""
         try:
             start = time.perf_counter()
-            depth = self._decode(image, self._params.depth_scale, source=self._image_topic)
+            params = self._params  # of this image, whatever is set meanwhile
+            depth = self._decode(image, params.depth_scale, source=self._image_topic)
             self._statistics.time(decode=time.perf_counter() - start)
-            intrinsics = self._camera.intrinsics(depth.shape[1], depth.shape[0], self._params)
-            hands = self._estimate(image.header, depth, intrinsics)
+            intrinsics = self._camera.intrinsics(depth.shape[1], depth.shape[0], params)
+            hands = self._estimate(image.header, depth, intrinsics, params)
             self._outputs.publish_joints(image.header, hands)
             self._statistics.time(total=time.perf_counter() - start)
             self._statistics.age(self.get_clock().now().nanoseconds - stamp_ns(image.header))
             self._statistics.count(answered=1, hands=len(hands))
-            self._outputs.publish_others(image.header, hands, depth, intrinsics, self._params)
+            self._outputs.publish_others(image.header, hands, depth, intrinsics, params)
         except HandPoseError as error:
             self._statistics.count(refused=1)
             self._complain(str(error))
@@ -275,8 +276,9 @@ class EstimatorNode(LifecycleNode):
                 self._statistics.count(refused=1)
                 self._complain(f'unexpected error on an image, please report it:\n{traceback.format_exc()}')
 
-    def _estimate(self, header: Header, depth: NDArray[np.float32], intrinsics: Intrinsics) -> list[HandEstimate]:
-        params, estimator = self._params, self._estimator
+    def _estimate(self, header: Header, depth: NDArray[np.float32], intrinsics: Intrinsics,
+                  params: parameters.Params) -> list[HandEstimate]:
+        estimator = self._estimator
         regions = self._regions if params.detector == 'region' else None
         assert estimator is not None
         params.apply(estimator)
@@ -300,11 +302,7 @@ def main(args: list[str] | None = None) -> int:
     Raises:
         HandPoseError: a parameter at start has a wrong type or value, or the arguments of ROS are no such.
     """
-    try:
-        rclpy.init(args=args)
-    except RuntimeError as error:  # RCLError, which rclpy keeps to itself
-        reason = re.sub(r', at /\S+:\d+', '', str(error).splitlines()[0])  # of the file in C
-        raise HandPoseError(f'the arguments of ROS cannot be used: {reason}') from error
+    ros.init(args)
     executor, node = SingleThreadedExecutor(), None
     try:
         node = EstimatorNode()

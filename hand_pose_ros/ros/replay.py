@@ -21,6 +21,7 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2, QosDurability, 
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool
 
+from hand_pose_ros import ros
 from hand_pose_ros.bags import Bag
 from hand_pose_ros.bags.bag import typestore
 from hand_pose_ros.errors import InputError
@@ -195,7 +196,7 @@ def replaying(path: str | PathLike[str], ros_args: Sequence[str] = (), **options
     """
     qos.let_large_images_through()
     # Without handlers of rclpy, Ctrl-C arrives between two messages.
-    rclpy.init(args=['--ros-args', *ros_args], signal_handler_options=SignalHandlerOptions.NO)
+    ros.init(['--ros-args', *ros_args], signal_handler_options=SignalHandlerOptions.NO)
     try:
         with Bag(path) as bag:
             replay = Replay(bag, **options)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
+from hand_pose_ros import ros
 from hand_pose_ros.depth import decode_compressed, decode_image
 from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.estimator import HandEstimate
@@ -35,7 +36,7 @@ def watch(on_depth: OnDepth, on_hands: OnHands, transport: str = 'raw', depth_sc
         transport, depth_scale: as the parameters of the node `estimator`.
         ros_args: remappings (`-r from:=to`) and so on.
     """
-    rclpy.init(args=['--ros-args', *ros_args])
+    ros.init(['--ros-args', *ros_args])
     try:
         _Watcher(on_depth, on_hands, transport, depth_scale).spin()
     except (KeyboardInterrupt, ExternalShutdownException):

@@ -226,7 +226,7 @@ def test_the_crop_is_centred_on_what_is_there():
     nothing = Cube((0.0, 0.0, 2.0), 0.3)
     assert center_of_mass_cube(np.zeros((240, 320), np.float32), nothing, camera) == nothing
     near = center_of_mass_cube(blob(camera, np.array([0.0, 0.0, 0.12])), Cube((0.0, 0.0, 0.12), 0.3), camera)
-    assert near.center[2] > 0.08, 'pixels without a reading are no surface'
+    assert near.center[2] > 0.06, 'pixels without a reading are no surface'
 
 
 def test_training_hands_can_do_without_an_ingredient():

@@ -20,6 +20,7 @@ def test_a_network_is_scored_on_the_frames_with_a_hand(tmp_path):
     summary = result.summary()
     assert summary['frames'] == present < 60
     assert np.isfinite(summary['mean_mm']) and summary['mean_mm'] > 10  # it has learned nothing
+    assert summary['error_jitter_mm'] is summary['bone_drift_mm'] is None, 'no frame follows another'
     assert sum(row['joints'] for row in summary['calibration_20_mm']) == 21 * present
     parts = [summary['visible_joints'], summary['hidden_joints']]
     assert sum(part['joints'] for part in parts) == 21 * present

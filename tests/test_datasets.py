@@ -206,7 +206,7 @@ def test_bags(tmp_path):
                 id='0', side=side, score=1.0, joints=joints, confidence=np.ones(21, np.float32),
                 cube=Cube((0.1, 0.0, 0.5), 0.3))], HAND21)
     dataset = open_dataset('bags', 'train', tmp_path)
-    assert dataset.size == 2 and dataset.skeleton.name == 'hand21'
+    assert dataset.size == 2 and dataset.skeleton.name == 'hand21' and dataset.cube_side == 0.3
     batch = dataset.batch(torch.tensor([1, 0]))
     metres = joints_in_metres(batch['joints'], batch['cube_center'], batch['cube_side'])
     np.testing.assert_allclose(metres[0], hands[2], atol=1e-5)

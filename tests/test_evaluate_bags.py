@@ -15,8 +15,9 @@ from hand_pose_ros.bags import Bag, BagWriter, read_hands
 from hand_pose_ros.cli import main
 from hand_pose_ros.cli.evaluate import _names
 from hand_pose_ros.errors import InputError
-from hand_pose_ros.estimator import HandEstimate
-from hand_pose_ros.evaluation.bag_evaluation import Settings, evaluate_bag
+from hand_pose_ros.estimator import HandEstimate, HandPoseEstimator
+from hand_pose_ros.evaluation import bag_evaluation
+from hand_pose_ros.evaluation.bag_evaluation import Settings, evaluate_bag, evaluate_bags
 from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.files import in_one_step
 from hand_pose_ros.geometry import Cube, Intrinsics
@@ -118,7 +119,7 @@ def test_truth_from_a_topic_a_file_or_text_gives_the_same_error(tmp_path, model,
     assert Result.load(tmp_path / 'r.npz').summary()['mean_mm'] == got['mean_mm']
 
 
-def test_truth_that_does_not_fit_is_refused(tmp_path, bag, model, result, capsys):
+def test_truth_that_does_not_fit_is_refused(tmp_path, bag, model, result, capsys, monkeypatch):
     np.savez(tmp_path / 'few.npz', joints=result.predictions[:3])
     np.savez(tmp_path / 'nyu.npz', joints=np.zeros((FRAMES, 14, 3)))
     np.savez(tmp_path / 'late.npz', joints=result.predictions, stamps_ns=result.stamps_ns + 10**12)
@@ -134,6 +135,8 @@ def test_truth_that_does_not_fit_is_refused(tmp_path, bag, model, result, capsys
             ('/truth/joints', 'HandJointsArray named /truth/joints'), ('truth.csv', 'no such file')):
         assert main(arguments(bag, model, '--ground-truth', source)) == 1
         assert message in capsys.readouterr().err
+    monkeypatch.setattr(HandPoseEstimator, '__call__', lambda *_, **__: pytest.fail('what is wrong is told first'))
+    assert main(arguments(bag, model, '--ground-truth', tmp_path / 'nyu.npz')) == 1
 
 
 def test_hands_go_into_a_bag_that_plays_beside_the_original(tmp_path, bag, model, result):
@@ -210,6 +213,19 @@ def test_many_bags_at_once_and_one_that_fails(tmp_path, bag, model, settings, ca
     alone = evaluate_bag(bag, settings)
     together = next(r for r in map(Result.load, results) if len(r.predictions) == FRAMES)
     assert together.predictions.tobytes() == alone.predictions.tobytes()
+
+
+def test_ctrl_c_begins_no_further_bag(bag, settings, monkeypatch):
+    begun = []
+
+    def interrupted(path, *_, **__):
+        begun.append(path)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(bag_evaluation, 'evaluate_bag', interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        evaluate_bags([bag, 'another.mcap'], settings, jobs=1)
+    assert begun == [bag]
 
 
 def test_processes_of_torchrun_share_the_bags(tmp_path, bag, model):

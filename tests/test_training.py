@@ -311,7 +311,8 @@ def test_training_learns_and_leaves_a_folder_that_tells_all(folder, tmp_path):
     with torch.no_grad():
         error = (shown.network(batch['patch'].float()) - batch['joints']).norm(dim=-1).mean() * 125
     assert error < 25 < first['val_mm'] / 1.5
-    assert shown.metadata['skeleton'] == 'icvl16' and shown.metadata['training_data'] == 'icvl-train'
+    assert {key: shown.metadata[key] for key in ('skeleton', 'cube_side', 'training_data')} == {
+        'skeleton': 'icvl16', 'cube_side': 0.25, 'training_data': 'icvl-train'}
     lines = [json.loads(line) for line in (tmp_path / 'metrics.jsonl').read_text().splitlines()]
     assert [line['samples'] for line in lines if 'val_mm' in line] == [480, 960]
     assert [line['step'] for line in lines if 'joints' in line] == [50, 60]

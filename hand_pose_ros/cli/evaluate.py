@@ -133,7 +133,7 @@ def _evaluate_live(args: argparse.Namespace, settings: Settings) -> Result:
     if args.out_bag:
         args.error('--out-bag does not work with --via-ros: record /hand/joints instead')
     from hand_pose_ros.bags import DepthBag
-    from hand_pose_ros.evaluation.ground_truth import with_truth
+    from hand_pose_ros.evaluation.ground_truth import read_truth, with_truth
     from hand_pose_ros.ros.live import play_through_node
     from hand_pose_ros.skeleton import get_skeleton
 
@@ -162,7 +162,9 @@ def _evaluate_live(args: argparse.Namespace, settings: Settings) -> Result:
         seconds={'image to joints': latency}, notes=notes if dropped else (), info={
             'bag': args.bags[0], 'depth_topic': topic, 'model': args.model or 'default', 'device': args.device,
             'via_ros': True, 'dropped': dropped, 'damaged': False})
-    return with_truth(result, args.ground_truth, args.bags[0]) if args.ground_truth else result
+    if not args.ground_truth:
+        return result
+    return with_truth(result, read_truth(args.ground_truth, args.bags[0], skeleton))
 
 
 def _run_bags(args: argparse.Namespace) -> int:

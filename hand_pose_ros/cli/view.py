@@ -5,24 +5,23 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hand_pose_ros.bags import DepthBag
+from hand_pose_ros.bags import DepthBag, Frame
 from hand_pose_ros.cli.arguments import add_bag, add_estimator, bag_options, count, estimator_options, keep_input
 from hand_pose_ros.depth import to_units
 from hand_pose_ros.errors import HandPoseError, InputError
+from hand_pose_ros.files import in_one_step
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.hand import HandEstimate
 from hand_pose_ros.markers import DELETE, SPHERE_LIST, HandMarkers, Marker
 from hand_pose_ros.skeleton import Skeleton
-
-if TYPE_CHECKING:
-    from types import TracebackType
 
 _EXAMPLES = """examples:
   hand-pose view recording.mcap
@@ -68,24 +67,37 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _view_bag(args: argparse.Namespace) -> int:
-    failed = 0
+    failed = shown = 0
     keep_input(args.save, args.bag)
     with DepthBag(args.bag, **bag_options(args)) as bag:
         from hand_pose_ros.estimator import HandPoseEstimator  # imports torch: not for --help and bad arguments
         estimator = HandPoseEstimator.from_pretrained(args.model, device=args.device, max_hands=args.max_hands,
                                                       **estimator_options(args))
         with Scene(args.save) as scene:
-            for frame in bag:
+            for frame in _until_damaged(bag):
                 try:
+                    if isinstance(frame, InputError):
+                        raise frame
                     depth, intrinsics = frame.depth, frame.intrinsics
+                    hands = estimator(depth, intrinsics, time_s=frame.stamp_ns / 1e9)
                 except InputError as error:
                     failed += 1
                     print(f'hand-pose view: {error}', file=sys.stderr)
                     continue
                 scene.add_depth(frame.stamp_ns, depth, intrinsics)
-                scene.add_hands(frame.stamp_ns, estimator(depth, intrinsics, time_s=frame.stamp_ns / 1e9),
-                                estimator.skeleton)
+                scene.add_hands(frame.stamp_ns, hands, estimator.skeleton)
+                shown += 1
+            if not shown:
+                raise InputError(f'{args.bag}: none of its images could be used, so there is nothing to view')
     return 1 if failed else 0
+
+
+def _until_damaged(bag: DepthBag) -> Iterator[Frame | InputError]:
+    """The frames of a bag; the last may be what is wrong with the rest."""
+    try:
+        yield from bag
+    except InputError as error:
+        yield error
 
 
 class Scene:
@@ -108,7 +120,7 @@ class Scene:
         if path is None and sys.platform == 'linux' and not {'DISPLAY', 'WAYLAND_DISPLAY'} & os.environ.keys():
             raise HandPoseError('there is no display for the viewer: write a file with --save FILE.rrd and open it '
                                 'where there is one, with rerun FILE.rrd')
-        self._rerun, self._path = rerun, path
+        self._rerun, self._file = rerun, ExitStack()
         self._markers: HandMarkers | None = None
         views = blueprint.Horizontal(blueprint.Spatial3DView(origin='/', name='hands in 3D'), blueprint.Spatial2DView(
             origin='/camera', contents=['/camera/**', '/hands/**'], name='depth image'))
@@ -117,14 +129,7 @@ class Scene:
         if path is None:
             self._stream.spawn(default_blueprint=layout)
         else:
-            self._part = path.with_name(f'.{path.name}.part')
-            try:
-                path.parent.mkdir(parents=True, exist_ok=True)
-                self._part.touch()
-            except OSError as error:
-                raise HandPoseError(f'{path}: cannot be written ({error.strerror}): give --save another place'
-                                    ) from error
-            self._stream.save(self._part, default_blueprint=layout)
+            self._stream.save(self._file.enter_context(in_one_step(path)), default_blueprint=layout)
         self._stream.log('/', rerun.ViewCoordinates.RDF, static=True)
 
     def add_depth(self, stamp_ns: int, depth: NDArray[np.float32], intrinsics: Intrinsics) -> None:
@@ -146,15 +151,10 @@ class Scene:
     def __enter__(self) -> Scene:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, _: BaseException | None, __: TracebackType | None) -> None:
+    def __exit__(self, *error: Any) -> None:
         self._stream.flush()
         self._stream.disconnect()
-        if self._path is None:
-            return
-        if kind is None:
-            os.replace(self._part, self._path)
-        else:
-            self._part.unlink(missing_ok=True)
+        self._file.__exit__(*error)
 
     def _at(self, stamp_ns: int) -> None:
         self._stream.set_time('stamp', timestamp=np.datetime64(stamp_ns, 'ns'))

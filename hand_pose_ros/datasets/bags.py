@@ -9,7 +9,6 @@ from hand_pose_ros.bags.reader import DepthBag, Frame, RecordedHands, read_hands
 from hand_pose_ros.datasets.base import DatasetError, LabelledFrame, RecordedDataset, fingerprint
 from hand_pose_ros.skeleton import Skeleton, get_skeleton
 
-CUBE_SIDE = 0.30
 SUFFIXES = ('.bag', '.mcap', '.db3')
 
 
@@ -37,7 +36,7 @@ class Bags(RecordedDataset):
                                f'not of {", ".join(sorted(names)) or "none"}')
         self.skeleton = get_skeleton(names.pop())
         self.size = len(self._samples)
-        self._reading: tuple[Path, Iterator[Frame], Frame] | None = None
+        self._reading: tuple[DepthBag, Iterator[Frame], Frame] | None = None
         self.fingerprint = fingerprint(self.name, *(
             f'{bag.stem}{hands.stamp_ns}{hands.joints[i].tolist()}'.encode() for bag, hands, i in self._samples))
 
@@ -45,19 +44,24 @@ class Bags(RecordedDataset):
         bag, hands, i = self._samples[index]
         frame = self._image(bag, hands.stamp_ns)
         joints = hands.joints[i]
-        return LabelledFrame(frame.depth, frame.intrinsics, joints, joints.mean(0), CUBE_SIDE, hands.sides[i] == 'left')
+        return LabelledFrame(frame.depth, frame.intrinsics, joints, joints.mean(0), self.cube_side,
+                             hands.sides[i] == 'left')
 
     def _image(self, bag: Path, stamp_ns: int) -> Frame:
         """A bag is read in the order of recording, so samples in the order of their index cost one pass over it."""
-        if self._reading is None or self._reading[0] != bag or self._reading[2].stamp_ns > stamp_ns:
-            frames = iter(DepthBag(bag))
-            self._reading = bag, frames, next(frames)
-        _, frames, frame = self._reading
+        if self._reading and (self._reading[0].path != bag or self._reading[2].stamp_ns > stamp_ns):
+            self._reading[0].close()
+            self._reading = None
+        if self._reading is None:
+            opened = DepthBag(bag)
+            frames = iter(opened)
+            self._reading = opened, frames, next(frames)
+        opened, frames, frame = self._reading
         while frame.stamp_ns < stamp_ns:
             frame = next(frames, frame)
             if frame is self._reading[2]:
                 break
-            self._reading = bag, frames, frame
+            self._reading = opened, frames, frame
         if frame.stamp_ns != stamp_ns:
             raise DatasetError(f'bags: {bag} has hands with the stamp {stamp_ns} ns, but no depth image with it')
         return frame

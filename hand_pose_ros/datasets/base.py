@@ -45,6 +45,8 @@ class Dataset(ABC):
     """Number of samples; None = as many as one asks for."""
     fingerprint: str
     """Changes whenever the samples change: caches are kept under it."""
+    cube_side: float = 0.30
+    """Metres; the usual side of the cubes, which whoever runs a network trained on them should use too."""
 
     @abstractmethod
     def batch(self, indices: Tensor) -> Batch:

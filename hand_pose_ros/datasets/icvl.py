@@ -12,7 +12,6 @@ from hand_pose_ros.skeleton import get_skeleton
 
 INTRINSICS = Intrinsics(241.42, 241.42, 160.0, 120.0, 320, 240)
 PALM = 0
-CUBE_SIDE = 0.250
 
 ROTATED_COPY = 6
 """Frames in folders with names of at most so many characters are turned copies of others; genuine ones have dates."""
@@ -27,6 +26,7 @@ class ICVL(RecordedDataset):
     """
 
     skeleton = get_skeleton('icvl16')
+    cube_side = 0.250
 
     def __init__(self, root: Path, split: str) -> None:
         self.name = f'icvl-{split}'
@@ -56,7 +56,7 @@ class ICVL(RecordedDataset):
         path, uvd = self._frames[index]
         depth = (read_depth(self._depth / path, 'ICVL') / 1000).astype(np.float32)
         joints = INTRINSICS.back_project(uvd[:, :2], uvd[:, 2] / 1000)
-        return LabelledFrame(depth, INTRINSICS, joints, joints[PALM], CUBE_SIDE)
+        return LabelledFrame(depth, INTRINSICS, joints, joints[PALM], self.cube_side)
 
 
 def _find(root: Path, part: str, names: list[str]) -> Path:

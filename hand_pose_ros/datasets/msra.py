@@ -32,6 +32,7 @@ class MSRA(RecordedDataset):
     """
 
     skeleton = get_skeleton('msra21')
+    cube_side = 0.180
 
     def __init__(self, root: Path, split: str, left_out: str = 'P0') -> None:
         subjects = [f'P{i}' for i in range(9)]

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from hand_pose_ros.bags import DepthBag, Frame
 from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.estimator import HandEstimate, HandPoseEstimator
-from hand_pose_ros.evaluation.ground_truth import with_truth
+from hand_pose_ros.evaluation.ground_truth import read_truth, with_truth
 from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.models.checkpoints import DEFAULT
@@ -55,7 +55,7 @@ class Settings:
         num_threads: of the network on the CPU; None chooses.
         estimator: further arguments of HandPoseEstimator.
         bag: arguments of DepthBag beside the path.
-        ground_truth: a file or a topic, see `ground_truth.with_truth`.
+        ground_truth: a file or a topic, see `ground_truth.read_truth`.
     """
 
     model: str | None = None
@@ -85,6 +85,7 @@ def evaluate_bag(path: str | Path, settings: Settings, progress: Progress | None
     """
     estimator = HandPoseEstimator.from_pretrained(
         settings.model, device=settings.device, num_threads=settings.num_threads, **settings.estimator)
+    truth = settings.ground_truth and read_truth(settings.ground_truth, path, estimator.skeleton)
     record = _Record(estimator)
     notes: list[str] = []
     start = time.perf_counter()
@@ -110,7 +111,7 @@ def evaluate_bag(path: str | Path, settings: Settings, progress: Progress | None
         seconds={stage: np.array(record.seconds[stage]) for stage in sorted(record.seconds, key=_stage_order)},
         info={'bag': str(path), 'depth_topic': bag.depth_topic, 'model': str(settings.model or DEFAULT),
               'engine': estimator.engine.name, 'frames_per_s': round(rate, 1), 'damaged': damaged})
-    return result if settings.ground_truth is None else with_truth(result, settings.ground_truth, path)
+    return with_truth(result, truth) if truth else result
 
 
 def evaluate_bags(paths: Sequence[str | Path], settings: Settings, jobs: int | None = None,
@@ -135,16 +136,8 @@ def evaluate_bags(paths: Sequence[str | Path], settings: Settings, jobs: int | N
     share = max(1, cores() // here)
     workers = max(1, min(jobs or share, len(mine)))
     settings = replace(settings, num_threads=settings.num_threads or max(1, share // workers))
-    done: dict[str | Path, Result | HandPoseError] = {}
-    # A single worker need not be another process, which would load everything again.
-    with ThreadPoolExecutor(1) if workers == 1 else ProcessPoolExecutor(workers, get_context('spawn')) as pool:
-        futures = {pool.submit(_attempt, path, settings, (open_sinks or {}).get(path)): path for path in mine}
-        finished = as_completed(futures)
-        for future in progress(finished, len(futures)) if progress else finished:
-            try:
-                done[futures[future]] = future.result()
-            except Exception as error:  # a defect of ours, or the process itself died: out of memory, say
-                done[futures[future]] = HandPoseError(f'{futures[future]}: stopped unexpectedly ({error!r})')
+    finished = _attempts(mine, settings, open_sinks or {}, workers)
+    done = dict(progress(finished, len(mine)) if progress else finished)
     if world > 1:
         done = _gather(done, rank, world)
     return {path: done[path] for path in paths if path in done}
@@ -238,11 +231,37 @@ def _until_damaged(frames: Iterable[Frame], notes: list[str]) -> Iterator[tuple[
         notes.append(f'{error}; only the images before the damage are evaluated.')
 
 
+def _attempts(paths: Sequence[str | Path], settings: Settings, sinks: Mapping[str | Path, OpenSink],
+              workers: int) -> Iterator[tuple[str | Path, Result | HandPoseError]]:
+    """Each bag as it is done, and what came of it."""
+    if workers == 1:  # need not be another process, which would load everything again
+        for path in paths:
+            yield path, _attempt(path, settings, sinks.get(path))
+        return
+    pool = ProcessPoolExecutor(workers, get_context('spawn'))
+    try:
+        futures = {pool.submit(_attempt, path, settings, sinks.get(path)): path for path in paths}
+        for future in as_completed(futures):
+            path = futures[future]
+            try:
+                yield path, future.result()
+            except Exception as error:  # the process itself died: out of memory, say
+                yield path, _unexpected(path, error)
+    finally:
+        pool.shutdown(cancel_futures=True)  # after Ctrl-C no further bag begins
+
+
 def _attempt(path: str | Path, settings: Settings, open_sink: OpenSink | None) -> Result | HandPoseError:
     try:
         return evaluate_bag(path, settings, open_sink=open_sink)
     except HandPoseError as error:
         return error
+    except Exception as error:  # a defect of ours must not lose the results of the other bags
+        return _unexpected(path, error)
+
+
+def _unexpected(path: str | Path, error: Exception) -> HandPoseError:
+    return HandPoseError(f'{path}: stopped unexpectedly ({error!r})')
 
 
 def _gather(done: dict[str | Path, Any], rank: int, world: int) -> dict[str | Path, Any]:

@@ -71,7 +71,7 @@ def evaluate_benchmark(model: str | None = None, device: str = 'auto', frames: i
         info |= _self_knowledge(*(np.concatenate(parts) for parts in zip(*judged, strict=True)))
     note = 'crops and sides are those of the benchmark; cameras are mixed, the intrinsics are nominal'
     return Result(str(model or DEFAULT), skeleton, Intrinsics(475.0, 475.0, 320.0, 240.0, 640, 480),
-                  np.concatenate(joints), np.concatenate(truth), notes=(note,), info=info)
+                  np.concatenate(joints), np.concatenate(truth), notes=(note,), info=info, in_time=False)
 
 
 def _by_visibility(joints: NDArray[np.float64], truth: NDArray[np.float64],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from hand_pose_ros.bags import read_hands
 from hand_pose_ros.errors import InputError
-from hand_pose_ros.evaluation.published import read_text
+from hand_pose_ros.evaluation.published import Labels, read_text
 from hand_pose_ros.evaluation.results import DAMAGE, Result
+from hand_pose_ros.skeleton import Skeleton
 
 TOLERANCE_NS = 10_000_000
 """A label belongs to the image with the nearest stamp, if it is not further away than this (10 ms)."""
@@ -19,52 +20,77 @@ TOLERANCE_NS = 10_000_000
 Joints = NDArray[np.float64]
 
 
-def with_truth(result: Result, source: str, bag: str | Path) -> Result:
-    """The result of N images of a bag, with the true joints; images without a label get a note.
+@dataclass(frozen=True)
+class Truth:
+    """The true joints of M frames, as their source has them.
+
+    Attributes:
+        joints: (M, J, 3) metres, optical frame, or the labels of a text file, which only a camera turns into that.
+        stamps_ns: (M,); None where the frames are those of the bag, in order.
+    """
+
+    source: str
+    joints: Joints | Labels
+    stamps_ns: NDArray[np.int64] | None = None
+
+
+def read_truth(source: str, bag: str | Path, skeleton: Skeleton) -> Truth:
+    """The true joints of a bag.
 
     Args:
         source: a topic of the bag with HandJointsArray, one hand a message; an .npz file with `joints` (M, J, 3) in
-            metres and, if M is not N, `stamps_ns` (M,); or a text file with `u v d` per joint and a line for each
-            image, see `published`.
+            metres and, if there are fewer than images, `stamps_ns` (M,); or a text file with `u v d` per joint and a
+            line for each image, see `published`.
 
     Raises:
-        InputError: there is no such source, or it does not fit the images.
+        InputError: there is no such source, or it does not fit the skeleton.
     """
-    stamps, joints = _read(source, bag, result)
-    expected = (len(result.skeleton), 3)
-    if joints.ndim != 3 or joints.shape[1:] != expected:
-        raise InputError(f'{source}: the truth has the shape {joints.shape}, but the joints of the estimator '
-                         f'({result.skeleton.name}) need (frames, {expected[0]}, 3)')
-    if stamps is None:
-        if len(joints) != len(result.predictions):
-            raise InputError(f'{source}: {len(joints)} labels for {len(result.predictions)} images: give one for each '
-                             'image, or an .npz file with stamps_ns')
-        truth = joints
-    else:
-        truth = _match(stamps, joints, result, source)
-    missing = int(np.isnan(truth).all((1, 2)).sum())
-    notes = (f'{missing} of {len(truth)} images have no label in {source} and are not scored.',) if missing else ()
-    return replace(result, truth=truth, notes=(*result.notes, *notes), info={**result.info, 'ground_truth': source})
+    truth = _read(source, bag, skeleton)
+    if not isinstance(truth.joints, Labels):
+        shape, expected = truth.joints.shape, (len(skeleton), 3)
+        if len(shape) != 3 or shape[1:] != expected:
+            raise InputError(f'{source}: the truth has the shape {shape}, but the joints of the estimator '
+                             f'({skeleton.name}) need (frames, {expected[0]}, 3)')
+    return truth
 
 
-def _read(source: str, bag: str | Path, result: Result) -> tuple[NDArray[np.int64] | None, Joints]:
+def with_truth(result: Result, truth: Truth) -> Result:
+    """The result of N images of a bag, with the true joints; images without a label get a note.
+
+    Raises:
+        InputError: the truth does not fit the images.
+    """
+    joints = truth.joints.points(result.intrinsics) if isinstance(truth.joints, Labels) else truth.joints
+    if truth.stamps_ns is not None:
+        joints = _match(truth.stamps_ns, joints, result, truth.source)
+    elif len(joints) != len(result.predictions):
+        raise InputError(f'{truth.source}: {len(joints)} labels for {len(result.predictions)} images: give one for '
+                         'each image, or an .npz file with stamps_ns')
+    missing = int(np.isnan(joints).all((1, 2)).sum())
+    notes = (f'{missing} of {len(joints)} images have no label in {truth.source} and are not scored.',) \
+        if missing else ()
+    return replace(result, truth=joints, notes=(*result.notes, *notes),
+                   info={**result.info, 'ground_truth': truth.source})
+
+
+def _read(source: str, bag: str | Path, skeleton: Skeleton) -> Truth:
     if not Path(source).is_file():
         if not source.startswith('/'):
             raise InputError(f'{source}: there is no such file, and it is no topic either, which begins with /')
         return _read_topic(source, bag)
-    if Path(source).suffix == '.npz':
-        try:
-            with np.load(source) as file:
-                stamps, joints = file.get('stamps_ns'), file['joints'].astype(np.float64)
-        except (OSError, *DAMAGE):
-            raise InputError(f'{source}: not an .npz file with an array joints (frames, joints, 3) in metres') from None
-        if stamps is not None and stamps.shape != (len(joints),):
-            raise InputError(f'{source}: stamps_ns of shape {stamps.shape} for {len(joints)} labels: give one for each')
-        return stamps, joints
-    return None, read_text(source, result.skeleton).points(result.intrinsics)
+    if Path(source).suffix != '.npz':
+        return Truth(source, read_text(source, skeleton))
+    try:
+        with np.load(source) as file:
+            stamps, joints = file.get('stamps_ns'), file['joints'].astype(np.float64)
+    except (OSError, *DAMAGE):
+        raise InputError(f'{source}: not an .npz file with an array joints (frames, joints, 3) in metres') from None
+    if stamps is not None and stamps.shape != (len(joints),):
+        raise InputError(f'{source}: stamps_ns of shape {stamps.shape} for {len(joints)} labels: give one for each')
+    return Truth(source, joints, stamps)
 
 
-def _read_topic(topic: str, bag: str | Path) -> tuple[NDArray[np.int64], Joints]:
+def _read_topic(topic: str, bag: str | Path) -> Truth:
     messages = [message for message in read_hands(bag, topic) if len(message.joints)]
     if not messages:
         raise InputError(f'{bag}: {topic} has no hand in any message, so there is nothing to compare with')
@@ -72,8 +98,8 @@ def _read_topic(topic: str, bag: str | Path) -> tuple[NDArray[np.int64], Joints]
         if len(message.joints) > 1:
             raise InputError(f'{bag}: {topic} has {len(message.joints)} hands at {message.stamp_ns} ns, but one hand '
                              'an image is evaluated: record one topic for each hand')
-    return (np.array([message.stamp_ns for message in messages]),
-            np.stack([message.joints[0] for message in messages]).astype(np.float64))
+    return Truth(topic, np.stack([message.joints[0] for message in messages]).astype(np.float64),
+                 np.array([message.stamp_ns for message in messages]))
 
 
 def _match(stamps: NDArray[np.int64], joints: Joints, result: Result, source: str) -> Joints:

@@ -251,6 +251,10 @@ def smoothness(predictions: ArrayLike, skeleton: Skeleton) -> dict[str, Any]:
                            'bone_drift_mm': mean_mm(bone_drift_mm(predictions, skeleton))})
 
 
+SMOOTHNESS = ('error_jitter_mm', 'jitter_mm', 'bone_drift_mm')
+"""The numbers of `summarise` that need frames in the order of time."""
+
+
 def finite_or_none(value: Any) -> Any:
     """The value with None for every NaN or inf in it, which JSON cannot hold."""
     if isinstance(value, dict):

@@ -40,6 +40,7 @@ class Result:
         parts: name -> (first row, row after the last) of the subjects or sequences that are reported apart.
         notes: whatever a reader of the numbers must know.
         info: where it comes from: files, model, device, command.
+        in_time: each frame follows the one before; if not, nothing is told of jitter and bone drift.
     """
 
     name: str
@@ -52,6 +53,7 @@ class Result:
     parts: Mapping[str, tuple[int, int]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     info: Mapping[str, Any] = field(default_factory=dict)
+    in_time: bool = True
 
     @property
     def errors_mm(self) -> NDArray[np.float64]:
@@ -67,23 +69,28 @@ class Result:
         if self.truth is None:
             summary |= metrics.smoothness(self.predictions, self.skeleton)
         else:
-            summary |= metrics.summarise(self.predictions, self.truth, self.skeleton)
+            summary |= self._accuracy(self.predictions, self.truth)
         summary |= {'frames_total': len(self.predictions),
                     'detection_rate': float(np.mean(detected)) if self.predictions.size else None}
         if self.parts and self.truth is not None:
             summary['parts'] = {
-                name: metrics.summarise(self.predictions[start:stop], self.truth[start:stop], self.skeleton)
+                name: self._accuracy(self.predictions[start:stop], self.truth[start:stop])
                 for name, (start, stop) in self.parts.items()}
         if self.seconds:
             summary['latency_ms'] = {
                 stage: metrics.percentiles(1000 * seconds) for stage, seconds in self.seconds.items()}
         return summary | {'notes': list(self.notes), **self.info}
 
+    def _accuracy(self, predictions: NDArray[np.float64], truth: NDArray[np.float64]) -> dict[str, Any]:
+        summary = metrics.summarise(predictions, truth, self.skeleton)
+        return summary if self.in_time else summary | dict.fromkeys(metrics.SMOOTHNESS)
+
     def save(self, path: str | Path) -> None:
         """Write everything to an .npz file, which `load` reads and numpy.load too."""
         meta = {'format': FORMAT, 'version': __version__, 'name': self.name, 'notes': self.notes,
                 'skeleton': asdict(self.skeleton), 'intrinsics': asdict(self.intrinsics),
-                'parts': dict(self.parts), 'info': dict(self.info), 'stages': list(self.seconds)}
+                'parts': dict(self.parts), 'info': dict(self.info), 'stages': list(self.seconds),
+                'in_time': self.in_time}
         arrays: dict[str, Any] = {'joints': self.predictions, 'meta': np.array(json.dumps(meta))}
         optional = {'truth': self.truth, 'stamps_ns': self.stamps_ns}
         arrays |= {key: value for key, value in optional.items() if value is not None}
@@ -110,7 +117,7 @@ class Result:
                     truth=file.get('truth'), stamps_ns=file.get('stamps_ns'),
                     seconds={stage: file[f'seconds_{k}'] for k, stage in enumerate(meta['stages'])},
                     parts={name: (start, stop) for name, (start, stop) in meta['parts'].items()},
-                    notes=tuple(meta['notes']), info=meta['info'])
+                    notes=tuple(meta['notes']), info=meta['info'], in_time=meta.get('in_time', True))
         except OSError as error:
             raise InputError(f'{path}: the file cannot be read ({error.strerror or error})') from None
         except DAMAGE:

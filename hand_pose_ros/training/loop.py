@@ -39,9 +39,6 @@ from hand_pose_ros.training.validation import estimate, first_samples
 
 log = logging.getLogger(__name__)
 
-CUBE_SIDE = 0.30
-"""Metres; what a checkpoint recommends to whoever runs it."""
-
 
 @dataclass(frozen=True)
 class Machine:
@@ -371,7 +368,7 @@ class Run:
             return first_samples(shards, self.recipe.val_samples)
 
     def _save_checkpoint(self, name: str, result: dict[str, Any]) -> None:
-        metadata = {'skeleton': self.skeleton.name, 'cube_side': CUBE_SIDE, 'validation': result,
+        metadata = {'skeleton': self.skeleton.name, 'cube_side': self.shards.dataset.cube_side, 'validation': result,
                     'samples': self.step * self.recipe.batch_size, 'recipe': recipe_to_dict(self.recipe),
                     'training_data': self.shards.dataset.name, 'training_shards': self.stream.shards_used(self.step)}
         if isinstance(self.averaged, RefinerObjective):

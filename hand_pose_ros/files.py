@@ -26,11 +26,12 @@ def in_one_step(path: str | Path) -> Iterator[Path]:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         part.touch()
+        mode = part.stat().st_mode
     except OSError as error:
         raise InputError(f'{path}: cannot be written ({error.strerror}): choose another place') from None
     try:
         yield part
-        os.chmod(part, 0o644)  # some libraries keep their files to their owner
+        os.chmod(part, mode)  # some libraries keep their files to their owner
         os.replace(part, path)
     finally:
         part.unlink(missing_ok=True)

@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ import torch
 from hand_pose_ros.bags import Bag, BagWriter, read_hands
 from hand_pose_ros.cli import main
 from hand_pose_ros.cli.evaluate import _names
+from hand_pose_ros.cli.hand_bag import HandBag
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.estimator import HandEstimate, HandPoseEstimator
 from hand_pose_ros.evaluation import bag_evaluation
@@ -157,6 +159,11 @@ def test_images_that_cannot_be_decoded_count_as_images_without_a_hand(tmp_path, 
     result = evaluate_bag(path, settings)
     assert np.isnan(result.predictions).all((1, 2)).tolist() == [False, True, False]
     assert '1 of 3 images could not be used' in result.notes[0] and '320x120' in result.notes[0]
+    with BagWriter(path) as bag:
+        bag.write_depth(10**9, 'camera', depth_image(1)[:120], CAMERA, codec=None)
+    with pytest.raises(InputError, match=r'no depth image to evaluate \(image 1: .*320x120'):
+        evaluate_bag(path, settings, open_sink=partial(HandBag, tmp_path / 'hands.mcap'))
+    assert not (tmp_path / 'hands.mcap').exists()
 
 
 def test_a_damaged_bag_is_evaluated_up_to_the_damage(tmp_path, bag, model, capsys):

@@ -243,6 +243,11 @@ def test_schedules():
     assert rates[2] == pytest.approx(modern.learning_rate / 2)
 
 
+def test_rmsprop_refuses_what_it_would_ignore():
+    with pytest.raises(HandPoseError, match='--set momentum=0 --set weight_decay=0'):
+        make_optimizer(get_recipe('paper', ['optimizer=rmsprop']), build('shallow', joints=16))
+
+
 def test_steps_of_muon_move_all_directions_equally_far():
     """Even where nearly all of a gradient is one direction; and the matrix keeps its rows and columns apart."""
     random = torch.Generator().manual_seed(0)
@@ -371,9 +376,12 @@ def test_a_stopped_run_continues_bit_for_bit(folder, tmp_path, recipe):
         run.train()
     facts = load_checkpoint(tmp_path / 'stopped' / 'last.safetensors').metadata  # weights to use
     assert (facts['samples'], facts['validation']) == (28, {})
+    metrics = tmp_path / 'stopped' / 'metrics.jsonl'  # as a process that was killed long after its last state leaves it
+    metrics.write_text('{"step": 3, "samples": 12}\n{"step": 8, "samples": 32}\n{"step": 9, "sam')
     again = tiny(folder, *overrides, recipe=recipe, out=tmp_path / 'stopped')
     again.train(resume=True)
     assert same_state(tmp_path / 'whole', tmp_path / 'stopped')
+    assert [json.loads(line)['step'] for line in metrics.read_text().splitlines()] == [3, 10, 10]
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 

@@ -97,10 +97,10 @@ def evaluate_bag(path: str | Path, settings: Settings, progress: Progress | None
         for image, hands in progress(done, len(bag)) if progress else done:
             if sink:
                 sink.add(image.frame, hands)
+        if record.intrinsics is None:
+            raise InputError(f'{path}: there is no depth image to evaluate'
+                             + (f' ({record.failures[0]})' if record.failures else ''))
     rate = len(record.stamps) / (time.perf_counter() - start)
-    if record.intrinsics is None:
-        raise InputError(f'{path}: there is no depth image to evaluate'
-                         + (f' ({record.failures[0]})' if record.failures else ''))
     damaged = bool(notes)
     if record.failures:
         notes.append(f'{len(record.failures)} of {len(record.stamps)} images could not be used and count as images '

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hand_pose_ros.errors import HandPoseError
-from hand_pose_ros.files import write_json
+from hand_pose_ros.files import write_bytes, write_json
 from hand_pose_ros.training.recipes import Recipe, recipe_from_dict, recipe_to_dict
 
 log = logging.getLogger(__name__)
@@ -62,8 +62,12 @@ class RunFolder:
         self.path.mkdir(parents=True, exist_ok=True)
         write_json(self.path / 'config.json', {'recipe': recipe_to_dict(recipe), 'git': _git_revision()})
 
-    def open(self) -> None:
-        """Begin to write."""
+    def open(self, step: int) -> None:
+        """Begin to write; what was written after this step of a run that goes on is written anew."""
+        metrics = self.path / 'metrics.jsonl'
+        if metrics.exists():
+            lines = metrics.read_text().splitlines(keepends=True)
+            write_bytes(metrics, ''.join(line for line in lines if _step(line) <= step).encode())
         self._log = logging.FileHandler(self.path / 'log.txt')
         self._log.setFormatter(logging.Formatter('%(asctime)s %(message)s'))
         logger = logging.getLogger(__package__)
@@ -89,6 +93,13 @@ class RunFolder:
         if self._log is not None:
             logging.getLogger(__package__).removeHandler(self._log)
             self._log.close()
+
+
+def _step(line: str) -> float:
+    try:
+        return float(json.loads(line)['step'])
+    except (ValueError, KeyError):  # the last one, of a process that was killed
+        return float('inf')
 
 
 def _git_revision() -> str | None:

@@ -235,7 +235,7 @@ class Run:
         elif self.rank == 0:
             self.folder.create(self.recipe)
         if self.rank == 0:
-            self.folder.open()
+            self.folder.open(self.step)
             log.info('step %s of %s, %s', self.step, self.steps, self.recipe)
 
     def _loop(self, module: nn.Module) -> dict[str, Any]:

@@ -87,7 +87,7 @@ def make_optimizer(recipe: Recipe, network: nn.Module) -> Optimizer:
     """The optimiser of a recipe for all parameters that want gradients; biases and norms are not decayed.
 
     Raises:
-        HandPoseError: unknown name.
+        HandPoseError: unknown name, or one that cannot do what the recipe says.
     """
     wanted = {name: p for name, p in network.named_parameters() if p.requires_grad}
     decayed = {name for name, p in wanted.items() if p.ndim > 1 and 'bias' not in name}
@@ -96,6 +96,9 @@ def make_optimizer(recipe: Recipe, network: nn.Module) -> Optimizer:
     if recipe.optimizer == 'sgd':
         return torch.optim.SGD(groups, lr=recipe.learning_rate, momentum=recipe.momentum)
     if recipe.optimizer == 'rmsprop':
+        if recipe.momentum or recipe.weight_decay:
+            raise HandPoseError('rmsprop is that of the original code, without momentum and weight decay: '
+                                '--set momentum=0 --set weight_decay=0')
         return FlooredRMSProp(list(wanted.values()), lr=recipe.learning_rate)
     if recipe.optimizer == 'adamw':
         return torch.optim.AdamW(groups, lr=recipe.learning_rate)

@@ -37,6 +37,17 @@ def in_one_step(path: str | Path) -> Iterator[Path]:
         part.unlink(missing_ok=True)
 
 
+def check_writable(path: str | Path) -> None:
+    """Raise InputError if there can be no such file: before the work whose result it is to hold."""
+    path = Path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f'{path}: cannot be written ({error.strerror}): choose another place') from None
+    if path.is_dir() or not os.access(path.parent, os.W_OK):
+        raise InputError(f'{path}: cannot be written: choose another place')
+
+
 def write_bytes(path: str | Path, data: bytes) -> None:
     """Write a whole file in one step."""
     with in_one_step(path) as part:

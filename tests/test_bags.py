@@ -237,6 +237,7 @@ def test_a_bag_that_is_cut_to_pieces_names_the_repair(tmp_path, depths, name, re
     with pytest.raises(InputError, match=f'{name}: .*{remedy}') as error:
         DepthBag(tmp_path / name)
     assert '\n' not in str(error.value)
+    assert ('before its first chunk was complete' in str(error.value)) == name.endswith('.mcap')
 
 
 def test_what_is_no_bag_is_refused(tmp_path):

@@ -65,6 +65,13 @@ def test_the_demo_leaves_pictures_and_numbers(tmp_path: Path, weights: Path, ros
     assert 'frames answered' in said and 'latency p99 ms' in said
 
 
+def test_a_node_that_cannot_start_is_not_waited_for(tmp_path: Path, ros_domain: int,
+                                                    capfd: pytest.CaptureFixture[str]) -> None:
+    write_bag(tmp_path / 'hand.mcap')
+    assert main(['demo', '--bag', str(tmp_path / 'hand.mcap'), '--model', 'nope', '--out', str(tmp_path / 'out')]) == 1
+    assert "hand-pose demo: the node does not start: there is no checkpoint named 'nope'" in capfd.readouterr().err
+
+
 def test_an_image_without_an_answer_is_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     answers = Answers('hand21', {1: HandJointsArray()}, {1: 0.012})
     summary = summarise([1, 2], answers, {1: []}, {})

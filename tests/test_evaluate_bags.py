@@ -139,6 +139,9 @@ def test_truth_that_does_not_fit_is_refused(tmp_path, bag, model, result, capsys
         assert message in capsys.readouterr().err
     monkeypatch.setattr(HandPoseEstimator, '__call__', lambda *_, **__: pytest.fail('what is wrong is told first'))
     assert main(arguments(bag, model, '--ground-truth', tmp_path / 'nyu.npz')) == 1
+    for option in ('--json', '--out', '--report'):
+        assert main(arguments(bag, model, option, tmp_path / 'nyu.npz' / 'a' / 'out.npz')) == 1
+        assert 'out.npz' in (said := capsys.readouterr().err) and 'cannot be written' in said
 
 
 def test_hands_go_into_a_bag_that_plays_beside_the_original(tmp_path, bag, model, result):
@@ -231,8 +234,22 @@ def test_ctrl_c_begins_no_further_bag(bag, settings, monkeypatch):
 
     monkeypatch.setattr(bag_evaluation, 'evaluate_bag', interrupted)
     with pytest.raises(KeyboardInterrupt):
-        evaluate_bags([bag, 'another.mcap'], settings, jobs=1)
+        list(evaluate_bags([bag, 'another.mcap'], settings, jobs=1))
     assert begun == [bag]
+
+
+def test_ctrl_c_loses_no_result(tmp_path, bag, model, monkeypatch):
+    def interrupted(path, *more, **options):
+        if path == 'another.mcap':
+            raise KeyboardInterrupt
+        return evaluate_bag(path, *more, **options)
+
+    monkeypatch.setattr(bag_evaluation, 'evaluate_bag', interrupted)
+    more = ['--jobs', 1, '--json', tmp_path / 'all.json', '--out', tmp_path / 'out']
+    command, first, *options = arguments(bag, model, *more)
+    assert main([command, first, 'another.mcap', *options]) == 1
+    assert list(json.loads((tmp_path / 'all.json').read_text())['bags']) == [str(bag)]
+    assert (tmp_path / 'out' / 'ball.npz').exists()
 
 
 def test_processes_of_torchrun_share_the_bags(tmp_path, bag, model):

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -153,6 +154,9 @@ def test_compare_prints_tables_and_intervals(result, tmp_path, capsys):
     low, high = got['differences'][0]['interval_mm']
     assert low < -half < high < 0, 'certainly better'
     assert (tmp_path / 'plots' / 'curves.svg').is_file()
+    replace(better, name=result.name).save(tmp_path / 'b.npz')  # two results of one bag have its name
+    assert main(['compare', str(tmp_path / 'a.npz'), str(tmp_path / 'b.npz'), '--block', '1']) == 0
+    assert 'b - a: -' in capsys.readouterr().out
 
 
 def test_compare_refuses_what_cannot_be_compared(result, tmp_path, capsys):

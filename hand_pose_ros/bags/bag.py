@@ -120,7 +120,8 @@ def _open(path: Path) -> tuple[AnyReader, bool]:
             interrupted = isinstance(attempt, _InterruptedMcap)
             if reader.connections or not interrupted:
                 return reader, interrupted
-            reader.close()  # not even the first chunk is complete
+            reader.close()
+            failure = InputError('it was cut short before its first chunk was complete')
         except Exception as error:  # errors of sqlite, YAML and of the decompressors come through as they are
             failure = failure or error
     raise InputError(f'{path}: the bag cannot be opened ({failure}); {_remedy(path)}') from failure

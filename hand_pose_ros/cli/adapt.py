@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import tempfile
 from collections.abc import Iterable
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from hand_pose_ros.cli.arguments import add_bag, bag_options, count
 from hand_pose_ros.errors import HandPoseError
+from hand_pose_ros.files import check_writable
 
 if TYPE_CHECKING:
     from hand_pose_ros.evaluation.bag_evaluation import Progress
@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     """Adapt, compare, write the weights, and say whether they are better."""
     if args.out.suffix != '.safetensors':
         args.parser.error(f'--out {args.out}: the name must end in .safetensors')
-    _check_writable(args.out)  # now, not after minutes of work
+    check_writable(args.out)  # now, not after minutes of work
 
     import torch
 
@@ -124,15 +124,6 @@ def run(args: argparse.Namespace) -> int:
               'they are more accurate only labels could tell (--ground-truth): look at the pictures of '
               '`hand-pose estimate --overlay` before and after.')
     return 0
-
-
-def _check_writable(path: Path) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise HandPoseError(f'{path}: cannot be written ({error.strerror}): choose another place') from None
-    if path.is_dir() or not os.access(path.parent, os.W_OK):
-        raise HandPoseError(f'{path}: cannot be written: choose another place')
 
 
 def _check_fits(checkpoint: Checkpoint, name: str) -> None:

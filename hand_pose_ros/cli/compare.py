@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
     if args.block < 1:
         args.error('--block must be at least 1')
     dataset = DATASETS[args.dataset] if args.dataset else None
-    results = [load_result(source, args.ground_truth, dataset) for source in args.results]
+    results = _named_apart([load_result(source, args.ground_truth, dataset) for source in args.results], args.results)
     for result in results:
         for note in result.notes:
             print(f'NOTE: {result.name}: {note}', file=sys.stderr)
@@ -77,6 +79,13 @@ def run(args: argparse.Namespace) -> int:
             raise InputError('results with different joints cannot be drawn into one picture: leave out --out')
         print(f'report: {write_report(results, Path(args.out))}')
     return 0
+
+
+def _named_apart(results: Sequence[Result], sources: Sequence[str]) -> list[Result]:
+    """The same results; those of one bag, which have its name, with the names of their files."""
+    names = [result.name for result in results]
+    return [replace(result, name=Path(source).stem) if names.count(result.name) > 1 and '=' not in source else result
+            for result, source in zip(results, sources, strict=True)]
 
 
 def _not_paired(a: Result, b: Result) -> str:

@@ -31,7 +31,7 @@ from hand_pose_ros.cli.hand_bag import HandBag
 from hand_pose_ros.depth import depth_problem, read_png
 from hand_pose_ros.drawing import overlay
 from hand_pose_ros.errors import HandPoseError, InputError
-from hand_pose_ros.files import in_one_step
+from hand_pose_ros.files import check_writable, in_one_step
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.hand import HandEstimate
 from hand_pose_ros.skeleton import Skeleton
@@ -214,6 +214,7 @@ class _Arrays:
     """One .npz with everything."""
 
     def __init__(self, path: Path, skeleton: Skeleton) -> None:
+        check_writable(path)
         self._path, self._skeleton = path, skeleton
         self._images: list[DepthInput] = []
         self._hands: list[tuple[int, HandEstimate]] = []

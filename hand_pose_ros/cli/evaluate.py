@@ -18,7 +18,7 @@ from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.evaluation import published
 from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.evaluation.tables import ACCURACY_COLUMNS, accuracy_rows, number, text_table
-from hand_pose_ros.files import write_json
+from hand_pose_ros.files import check_writable, write_json
 
 if TYPE_CHECKING:
     from hand_pose_ros.evaluation.bag_evaluation import Settings
@@ -76,6 +76,9 @@ def run(args: argparse.Namespace) -> int:
     """Evaluate, print, and write what was asked for; 1 if a bag failed or was damaged."""
     if bool(args.bags) == bool(args.predictions):
         args.error('give either bags or --predictions')
+    if len(args.bags) <= 1:
+        for path in filter(None, (args.json, args.out, args.report and Path(args.report) / 'report.html')):
+            check_writable(path)  # now, not after minutes of work
     if args.predictions:
         return _run_text(args)
     if args.bags == ['synthetic-test-v1']:
@@ -134,6 +137,7 @@ def _evaluate_live(args: argparse.Namespace, settings: Settings) -> Result:
         args.error('--out-bag does not work with --via-ros: record /hand/joints instead')
     from hand_pose_ros.bags import DepthBag
     from hand_pose_ros.evaluation.ground_truth import read_truth, with_truth
+    from hand_pose_ros.models.checkpoints import load_checkpoint
     from hand_pose_ros.ros.live import play_through_node
     from hand_pose_ros.skeleton import get_skeleton
 
@@ -143,13 +147,14 @@ def _evaluate_live(args: argparse.Namespace, settings: Settings) -> Result:
     if args.intrinsics:
         parameters |= {f'intrinsics.{name}': value for name, value in zip(('fx', 'fy', 'cx', 'cy'), args.intrinsics,
                                                                           strict=True)}
+    skeleton = get_skeleton(load_checkpoint(args.model).metadata['skeleton'])
+    truth = args.ground_truth and read_truth(args.ground_truth, args.bags[0], skeleton)
     with DepthBag(args.bags[0], **settings.bag) as bag:
         intrinsics = next(iter(bag)).intrinsics
         stamps = [frame.stamp_ns for frame in bag]
         answers = play_through_node(bag, args.camera_info_topic,
                                     {name: value for name, value in parameters.items() if value is not None})
         topic = bag.depth_topic
-    skeleton = get_skeleton(answers.skeleton)
     joints = np.full((len(stamps), len(skeleton), 3), np.nan)
     for row, stamp in enumerate(stamps):
         if stamp in answers.hands and answers.hands[stamp].hands:
@@ -162,9 +167,7 @@ def _evaluate_live(args: argparse.Namespace, settings: Settings) -> Result:
         seconds={'image to joints': latency}, notes=notes if dropped else (), info={
             'bag': args.bags[0], 'depth_topic': topic, 'model': args.model or 'default', 'device': args.device,
             'via_ros': True, 'dropped': dropped, 'damaged': False})
-    if not args.ground_truth:
-        return result
-    return with_truth(result, read_truth(args.ground_truth, args.bags[0], skeleton))
+    return with_truth(result, truth) if truth else result
 
 
 def _run_bags(args: argparse.Namespace) -> int:
@@ -174,25 +177,29 @@ def _run_bags(args: argparse.Namespace) -> int:
     if args.compare or args.via_ros:
         args.error('--compare and --via-ros work with one bag, not with several')
     settings, names = _settings(args), _names(args.bags)
+    for path in filter(None, (args.json, *(folder and Path(folder) / 'any' for folder in (args.out, args.report)))):
+        check_writable(path)
     sinks = {bag: partial(HandBag, Path(args.out_bag) / f'{names[bag]}.mcap') for bag in args.bags if args.out_bag}
     for bag in sinks:
         keep_input(Path(args.out_bag) / f'{names[bag]}.mcap', bag)
-    outcomes = evaluate_bags(args.bags, settings, args.jobs, _progress('bags'), sinks)
     summaries: dict[str, Any] = {}
-    for bag, outcome in outcomes.items():
-        print(f'\n{bag}')
-        if isinstance(outcome, HandPoseError):
-            print(f'FAILED: {outcome}', file=sys.stderr)
-            summaries[str(bag)] = {'error': str(outcome)}
-            continue
-        result = replace(outcome, name=names[str(bag)])
-        summaries[str(bag)] = result.summary()
-        single = argparse.Namespace(
-            json=None, report=args.report and Path(args.report) / result.name,
-            out=args.out and Path(args.out) / f'{result.name}.npz')
-        _deliver(single, result, [], lambda rows, bag=bag: read_depths(bag, rows, settings))  # type: ignore[misc]
-    if args.json and outcomes:
-        write_json(args.json, {'bags': summaries})
+    try:
+        for bag, outcome in evaluate_bags(args.bags, settings, args.jobs, _progress('bags'), sinks):
+            with tqdm.external_write_mode():
+                print(f'\n{bag}', flush=True)
+                if isinstance(outcome, HandPoseError):
+                    print(f'FAILED: {outcome}', file=sys.stderr)
+                    summaries[str(bag)] = {'error': str(outcome)}
+                    continue
+                result = replace(outcome, name=names[str(bag)])
+                summaries[str(bag)] = result.summary()
+                single = argparse.Namespace(
+                    json=None, report=args.report and Path(args.report) / result.name,
+                    out=args.out and Path(args.out) / f'{result.name}.npz')
+                _deliver(single, result, [], lambda rows, bag=bag: read_depths(bag, rows, settings))  # type: ignore[misc]
+    finally:  # after Ctrl-C, too
+        if args.json and summaries:
+            write_json(args.json, {'bags': {bag: summaries[bag] for bag in args.bags if bag in summaries}})
     failed = [bag for bag, summary in summaries.items() if 'error' in summary or summary['damaged']]
     if failed:
         print(f'\n{len(failed)} of {len(summaries)} bags failed or are damaged: {", ".join(failed)}', file=sys.stderr)

@@ -167,7 +167,7 @@ def _write(args: argparse.Namespace) -> None:
 
     hands = _hands(args, args.sensors, device=args.device)
     args.out.mkdir(parents=True, exist_ok=True)
-    for indices in tqdm(list(_indices(args.start, args.number, args.shard)), unit='shard'):
+    for indices in tqdm(list(_indices(args.start, args.number, args.shard)), unit='shard', disable=None):
         arrays: dict[str, Any] = {name: values.cpu().numpy() for name, values in hands.batch(indices).items()}
         arrays['index'] = indices.numpy()
         arrays['patch'] = arrays['patch'].astype(np.float16)  # exact to 0.1 mm
@@ -188,7 +188,8 @@ def _record(args: argparse.Namespace) -> None:
 
     sequence = _hands(args, args.sensors).sequence(args.start, args.number)
     with BagWriter(args.out) as bag:
-        for i, (depth, camera, joints, side) in enumerate(tqdm(sequence, total=args.number, unit='images')):
+        images = tqdm(sequence, total=args.number, unit='images', disable=None)
+        for i, (depth, camera, joints, side) in enumerate(images):
             stamp, frame = (i + 1) * 1_000_000_000 // 30, 'camera_depth_optical_frame'
             middle = joints.mean(axis=0)
             truth = HandEstimate(joints, HAND21.joint_names, np.ones(len(HAND21), np.float32), 1.0, side,

@@ -30,6 +30,7 @@ from hand_pose_ros.skeleton import Skeleton
 
 _T = TypeVar('_T')
 _R = TypeVar('_R')
+Outcome = Result | HandPoseError
 AHEAD = 2
 """So many images are decoded before their turn."""
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
@@ -116,19 +117,19 @@ def evaluate_bag(path: str | Path, settings: Settings, progress: Progress | None
 
 def evaluate_bags(paths: Sequence[str | Path], settings: Settings, jobs: int | None = None,
                   progress: Progress | None = None,
-                  open_sinks: Mapping[str | Path, OpenSink] | None = None) -> dict[str | Path, Result | HandPoseError]:
+                  open_sinks: Mapping[str | Path, OpenSink] | None = None) -> Iterator[tuple[str | Path, Outcome]]:
     """Evaluate many bags at once; one that fails does not stop the others.
 
     Where torchrun has started several processes, on one or more machines, each takes its share of the bags, and the
-    first gets all results; the others get none.
+    first gets all results in the end; the others get none.
 
     Args:
         jobs: bags at the same time on this machine; None takes one per core.
         progress: wraps the finished bags.
         open_sinks: for each bag, see `evaluate_bag`; sent to other processes.
 
-    Returns:
-        For each path the result, or what went wrong.
+    Yields:
+        Each path with its result, or with what went wrong, as soon as it is done.
     """
     world, rank = int(os.environ.get('WORLD_SIZE', 1)), int(os.environ.get('RANK', 0))
     here = int(os.environ.get('LOCAL_WORLD_SIZE', 1))
@@ -136,11 +137,10 @@ def evaluate_bags(paths: Sequence[str | Path], settings: Settings, jobs: int | N
     share = max(1, cores() // here)
     workers = max(1, min(jobs or share, len(mine)))
     settings = replace(settings, num_threads=settings.num_threads or max(1, share // workers))
-    finished = _attempts(mine, settings, open_sinks or {}, workers)
-    done = dict(progress(finished, len(mine)) if progress else finished)
-    if world > 1:
-        done = _gather(done, rank, world)
-    return {path: done[path] for path in paths if path in done}
+    finished: Iterable[tuple[str | Path, Outcome]] = _attempts(mine, settings, open_sinks or {}, workers)
+    if progress:
+        finished = progress(finished, len(mine))
+    yield from finished if world == 1 else _gather(dict(finished), rank, world).items()
 
 
 def read_depths(path: str | Path, rows: Sequence[int], settings: Settings) -> dict[int, NDArray[np.float32]]:
@@ -232,7 +232,7 @@ def _until_damaged(frames: Iterable[Frame], notes: list[str]) -> Iterator[tuple[
 
 
 def _attempts(paths: Sequence[str | Path], settings: Settings, sinks: Mapping[str | Path, OpenSink],
-              workers: int) -> Iterator[tuple[str | Path, Result | HandPoseError]]:
+              workers: int) -> Iterator[tuple[str | Path, Outcome]]:
     """Each bag as it is done, and what came of it."""
     if workers == 1:  # need not be another process, which would load everything again
         for path in paths:
@@ -251,7 +251,7 @@ def _attempts(paths: Sequence[str | Path], settings: Settings, sinks: Mapping[st
         pool.shutdown(cancel_futures=True)  # after Ctrl-C no further bag begins
 
 
-def _attempt(path: str | Path, settings: Settings, open_sink: OpenSink | None) -> Result | HandPoseError:
+def _attempt(path: str | Path, settings: Settings, open_sink: OpenSink | None) -> Outcome:
     try:
         return evaluate_bag(path, settings, open_sink=open_sink)
     except HandPoseError as error:
@@ -264,7 +264,7 @@ def _unexpected(path: str | Path, error: Exception) -> HandPoseError:
     return HandPoseError(f'{path}: stopped unexpectedly ({error!r})')
 
 
-def _gather(done: dict[str | Path, Any], rank: int, world: int) -> dict[str | Path, Any]:
+def _gather(done: dict[str | Path, Outcome], rank: int, world: int) -> dict[str | Path, Outcome]:
     """Everybody's results at the first process; none elsewhere."""
     import torch.distributed as dist
 

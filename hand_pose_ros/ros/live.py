@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CompressedImage, Image
@@ -69,7 +70,8 @@ def play_through_node(bag: DepthBag, camera_info_topic: str | None = None,
     infos = {camera_info_topic or beside} & {connection.topic for connection in bag.connections}
     arguments = [item for name, value in {'transport': transport, **(parameters or {})}.items()
                  for item in ('-p', f'{name}:={value}')]
-    remappings = {'__ns': namespace, IMAGE: image, CAMERA_INFO: camera_info_topic or beside}
+    remappings = {'__ns': namespace, '/diagnostics': f'{namespace}/diagnostics', IMAGE: image,
+                  CAMERA_INFO: camera_info_topic or beside}
     arguments += [item for name, topic in remappings.items() for item in ('-r', f'{name}:={topic}')]
     if ours := not rclpy.ok():
         qos.let_large_images_through()
@@ -77,7 +79,9 @@ def play_through_node(bag: DepthBag, camera_info_topic: str | None = None,
     try:
         with _listening(namespace, bag.depth_topic, Image if transport == 'raw' else CompressedImage) as listener, \
                 _running(arguments) as process:
-            _wait_until(lambda: bool(listener.skeleton), process, START_TIMEOUT_S)
+            _wait_until(lambda: bool(listener.skeleton or listener.failure), process, START_TIMEOUT_S)
+            if listener.failure:
+                raise HandPoseError(f'the node does not start: {listener.failure}')
             replay = Replay(bag, topics={bag.depth_topic, *infos}, reliability='reliable')
             try:
                 replay.wait_for_subscribers(START_TIMEOUT_S, 2 + len(infos))  # node and listener; camera_info: node
@@ -101,13 +105,14 @@ class _Listener:
 
     def __init__(self, namespace: str, depth_topic: str, image_type: type) -> None:
         self.node = rclpy.create_node('listener', namespace=namespace)
-        self.skeleton = ''
+        self.skeleton = self.failure = ''
         self.seen: dict[int, float] = {}
         self.answers: dict[int, tuple[float, HandJointsArray]] = {}
         # Serialized, for unpacking large images here would slow down what is measured.
         self.node.create_subscription(image_type, depth_topic, self._on_image, QoSProfile(depth=10), raw=True)
         self.node.create_subscription(HandJointsArray, 'hand/joints', self._on_answer, QoSProfile(depth=100))
         self.node.create_subscription(HandSkeleton, 'hand/skeleton', self._on_skeleton, qos.LATCHED)
+        self.node.create_subscription(DiagnosticArray, 'diagnostics', self._on_diagnostics, qos.RESULTS)
 
     def wait_until_quiet(self) -> None:
         """Wait until all images are answered, or no answer has come for a while."""
@@ -127,6 +132,9 @@ class _Listener:
 
     def _on_skeleton(self, skeleton: HandSkeleton) -> None:
         self.skeleton = skeleton.name
+
+    def _on_diagnostics(self, diagnostics: DiagnosticArray) -> None:
+        self.failure = next((one.message for one in diagnostics.status if one.level == DiagnosticStatus.ERROR), '')
 
 
 @contextmanager

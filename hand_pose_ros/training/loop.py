@@ -241,8 +241,9 @@ class Run:
     def _loop(self, module: nn.Module) -> dict[str, Any]:
         recipe = self.recipe
         result: dict[str, Any] = {}
+        since, at = self.step, time.monotonic()
         with tqdm(total=self.budget, initial=self.step * recipe.batch_size, unit='samples', unit_scale=True,
-                  smoothing=0.05, disable=self.rank > 0, dynamic_ncols=True) as bar:
+                  smoothing=0.05, disable=self.rank > 0 or None, dynamic_ncols=True) as bar:
             while self.step < self.steps:
                 terms = self._train_step(module)
                 self.step += 1
@@ -251,8 +252,9 @@ class Run:
                 if (self.step % 50 == 0 or last) and self.rank == 0:
                     values = {name: round(float(value), 6) for name, value in terms.items()}
                     bar.set_postfix({**values, **result})
-                    self.folder.write({'step': self.step, 'samples': done, **values,
-                                       'rate': round(bar.format_dict['rate'] or 0, 1),
+                    rate = (self.step - since) * recipe.batch_size / (time.monotonic() - at)
+                    since, at = self.step, time.monotonic()
+                    self.folder.write({'step': self.step, 'samples': done, **values, 'rate': round(rate, 1),
                                        'learning_rate': self.optimizer.param_groups[0]['lr']})
                 if self._ending and not last:
                     raise KeyboardInterrupt

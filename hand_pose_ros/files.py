@@ -19,16 +19,8 @@ def in_one_step(path: str | Path) -> Iterator[Path]:
     Raises:
         InputError: the folder cannot be made or written.
     """
-    path = Path(path)
-    if path.is_dir():
-        raise InputError(f'{path}: is a folder: give the name of a file')
-    part = path.with_name(f'.{path.name}.{os.getpid()}.part')
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part.touch()
-        mode = part.stat().st_mode
-    except OSError as error:
-        raise InputError(f'{path}: cannot be written ({error.strerror}): choose another place') from None
+    part = _begin(path)
+    mode = part.stat().st_mode
     try:
         yield part
         os.chmod(part, mode)  # some libraries keep their files to their owner
@@ -39,13 +31,21 @@ def in_one_step(path: str | Path) -> Iterator[Path]:
 
 def check_writable(path: str | Path) -> None:
     """Raise InputError if there can be no such file: before the work whose result it is to hold."""
+    _begin(path).unlink()
+
+
+def _begin(path: str | Path) -> Path:
+    """An empty file beside `path`."""
     path = Path(path)
+    if path.is_dir():
+        raise InputError(f'{path}: is a folder: give the name of a file')
+    part = path.with_name(f'.{path.name}.{os.getpid()}.part')
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        part.touch()
     except OSError as error:
         raise InputError(f'{path}: cannot be written ({error.strerror}): choose another place') from None
-    if path.is_dir() or not os.access(path.parent, os.W_OK):
-        raise InputError(f'{path}: cannot be written: choose another place')
+    return part
 
 
 def write_bytes(path: str | Path, data: bytes) -> None:

@@ -159,9 +159,10 @@ def test_a_mirrored_scene_gives_mirrored_joints_of_the_other_hand(estimator, seq
     for frame in sequence:
         [other] = estimator(*mirrored(frame.depth, frame.intrinsics))
     assert {hand.side, other.side} == {'left', 'right'}
-    # Pixels fall elsewhere in the mirror, which moves what the paper's networks answer more than dense votes.
-    dense = 'hand' in estimator.engine.outputs
-    assert np.abs(other.joints * (-1, 1, 1) - hand.joints).max() < (0.010 if dense else 0.020)
+    # Pixels fall elsewhere in the mirror, and what that moves, the cube of the next image follows. Regression, with
+    # nothing behind it, is moved most.
+    refined, dense = 'refiner' in estimator.metadata, 'hand' in estimator.engine.outputs
+    assert np.abs(other.joints * (-1, 1, 1) - hand.joints).max() < (0.005 if dense else 0.010 if refined else 0.015)
 
 
 def test_a_side_that_is_settled_is_not_asked_again_in_every_image(sequence, monkeypatch):

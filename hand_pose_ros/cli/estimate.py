@@ -161,7 +161,7 @@ def _open(args: argparse.Namespace, stack: ExitStack) -> tuple[Iterator[DepthInp
         check_intrinsics(args)
         return _from_pngs(paths, args.intrinsics, args.depth_scale or 0.001), len(paths)
     bag = stack.enter_context(DepthBag(args.input, **bag_options(args)))
-    return _from_bag(bag), len(bag)
+    return from_bag(bag), len(bag)
 
 
 def _from_pngs(paths: Sequence[Path], intrinsics: Sequence[float], depth_scale: float) -> Iterator[DepthInput]:
@@ -175,14 +175,14 @@ def _from_pngs(paths: Sequence[Path], intrinsics: Sequence[float], depth_scale: 
         yield DepthInput(path.stem, i * _PNG_PERIOD_NS, 'camera', lambda path=path: load(path))  # type: ignore[misc]
 
 
-def _from_bag(bag: DepthBag) -> Iterator[DepthInput]:
+def from_bag(bag: DepthBag) -> Iterator[DepthInput]:
+    """The images of a bag; what is damaged of it is one more, which cannot be loaded."""
     i = 0
     try:
         for i, frame in enumerate(bag, start=1):
             yield DepthInput(f'{i - 1:06d}', frame.stamp_ns, frame.frame_id,
                              lambda frame=frame: (frame.depth, frame.intrinsics))  # type: ignore[misc]
     except InputError as error:
-        # The damage of a bag is one more image that cannot be used; what came before it counts.
         def fail(error: InputError = error) -> tuple[NDArray[np.float32], Intrinsics]:
             raise error
         yield DepthInput(f'{i:06d}', 0, '', fail)

@@ -76,9 +76,9 @@ def run(args: argparse.Namespace) -> int:
     """Evaluate, print, and write what was asked for; 1 if a bag failed or was damaged."""
     if bool(args.bags) == bool(args.predictions):
         args.error('give either bags or --predictions')
-    if len(args.bags) <= 1:
-        for path in filter(None, (args.json, args.out, args.report and Path(args.report) / 'report.html')):
-            check_writable(path)  # now, not after minutes of work
+    out = Path(args.out) / 'any.npz' if args.out and len(args.bags) > 1 else args.out
+    for path in filter(None, (args.json, out, args.report and Path(args.report) / 'report.html')):
+        check_writable(path)  # now, not after minutes of work
     if args.predictions:
         return _run_text(args)
     if args.bags == ['synthetic-test-v1']:
@@ -177,8 +177,6 @@ def _run_bags(args: argparse.Namespace) -> int:
     if args.compare or args.via_ros:
         args.error('--compare and --via-ros work with one bag, not with several')
     settings, names = _settings(args), _names(args.bags)
-    for path in filter(None, (args.json, *(folder and Path(folder) / 'any' for folder in (args.out, args.report)))):
-        check_writable(path)
     sinks = {bag: partial(HandBag, Path(args.out_bag) / f'{names[bag]}.mcap') for bag in args.bags if args.out_bag}
     for bag in sinks:
         keep_input(Path(args.out_bag) / f'{names[bag]}.mcap', bag)

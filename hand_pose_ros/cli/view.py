@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hand_pose_ros.bags import DepthBag, Frame
+from hand_pose_ros.bags import DepthBag
 from hand_pose_ros.cli.arguments import add_bag, add_estimator, bag_options, count, estimator_options, keep_input
+from hand_pose_ros.cli.estimate import from_bag
 from hand_pose_ros.depth import to_units
 from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.files import in_one_step
@@ -74,30 +75,20 @@ def _view_bag(args: argparse.Namespace) -> int:
         estimator = HandPoseEstimator.from_pretrained(args.model, device=args.device, max_hands=args.max_hands,
                                                       **estimator_options(args))
         with Scene(args.save) as scene:
-            for frame in _until_damaged(bag):
+            for image in from_bag(bag):
                 try:
-                    if isinstance(frame, InputError):
-                        raise frame
-                    depth, intrinsics = frame.depth, frame.intrinsics
-                    hands = estimator(depth, intrinsics, time_s=frame.stamp_ns / 1e9)
+                    depth, intrinsics = image.load()
+                    hands = estimator(depth, intrinsics, time_s=image.stamp_ns / 1e9)
                 except InputError as error:
                     failed += 1
                     print(f'hand-pose view: {error}', file=sys.stderr)
                     continue
-                scene.add_depth(frame.stamp_ns, depth, intrinsics)
-                scene.add_hands(frame.stamp_ns, hands, estimator.skeleton)
+                scene.add_depth(image.stamp_ns, depth, intrinsics)
+                scene.add_hands(image.stamp_ns, hands, estimator.skeleton)
                 shown += 1
             if not shown:
                 raise InputError(f'{args.bag}: none of its images could be used, so there is nothing to view')
     return 1 if failed else 0
-
-
-def _until_damaged(bag: DepthBag) -> Iterator[Frame | InputError]:
-    """The frames of a bag; the last may be what is wrong with the rest."""
-    try:
-        yield from bag
-    except InputError as error:
-        yield error
 
 
 class Scene:

@@ -9,7 +9,7 @@ from torch import nn
 
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.models import ARCHITECTURES, build
-from hand_pose_ros.models.dense import cells, decode, encode
+from hand_pose_ros.models.dense import JointRefinement, cells, decode, encode, sample
 from hand_pose_ros.models.prior import fit_prior
 from hand_pose_ros.models.refiner import Refiner
 from hand_pose_ros.models.two_looks import View
@@ -330,6 +330,36 @@ def test_dense_cells_are_in_cube_units():
     torch.testing.assert_close(positions[0, :, 2, 30], torch.tensor([122 / 64 - 1, 10 / 64 - 1, -0.5]))
     assert seen.sum() == 1
     assert (positions[0, 2] == 1).sum() == 1023
+
+
+def test_maps_are_read_between_their_cells():
+    maps, points = torch.randn(2, 5, 32, 16), torch.rand(2, 7, 2) * 1.8 - 0.9
+    expected = F.grid_sample(maps, points[:, :, None], align_corners=False)[..., 0].transpose(1, 2)
+    torch.testing.assert_close(sample(maps, points), expected, atol=1e-5, rtol=0)
+    assert sample(maps, torch.full((2, 1, 2), 7.0)).isfinite().all()
+
+
+def test_a_refinement_starts_as_the_identity_and_learns_from_what_is_seen_at_the_joints():
+    truth = torch.rand(400, 4, 3) - 0.5
+    joints = truth + 0.1 * torch.randn_like(truth)
+    # Maps like those a network would make: where a joint may be, they tell how deep the hand is there.
+    local = torch.zeros(400, 2, 32, 32)
+    rows, cols = ((truth[..., k] + 1) * 16 for k in (1, 0))
+    line = torch.arange(32) + 0.5
+    for joint in range(4):
+        near = (-((line[:, None] - rows[:, joint, None, None]) ** 2 + (line - cols[:, joint, None, None]) ** 2) / 32)
+        local[:, 0] += near.exp()
+        local[:, 1] += near.exp() * truth[:, joint, 2, None, None]
+    told = joints, joints, torch.zeros(400, 4), local, torch.randn(400, 3)
+    refinement = JointRefinement(4, local=2, whole=3)
+    torch.testing.assert_close(refinement(*told), joints)
+    optimizer = torch.optim.AdamW(refinement.parameters(), 1.4e-3)
+    for _ in range(100):
+        optimizer.zero_grad()
+        F.smooth_l1_loss(refinement(*told), truth, beta=0.01).backward()
+        optimizer.step()
+    deeper = (refinement.eval()(*told) - truth).detach()[..., 2].abs().mean()
+    assert deeper < 0.5 * (joints - truth)[..., 2].abs().mean()
 
 
 def test_dense_network_says_everything_and_survives_an_empty_patch():

@@ -38,11 +38,11 @@ def hand_patches(count: int, seed: int = 0) -> np.ndarray:
 def trained(architecture: str) -> torch.nn.Module:
     """A network that answers as a trained one does: normalised inside, joints inside the cube."""
     torch.manual_seed(0)
-    options = {'last_stride': 2, 'blocks': 2} if architecture == 'resnet' else {}
-    network = build(architecture, **options).requires_grad_(False)
+    options = {'resnet': {'last_stride': 2, 'blocks': 2}, 'two_looks': {'bottleneck': 30, 'refined': True}}
+    network = build(architecture, **options.get(architecture, {})).requires_grad_(False)
     patches = torch.from_numpy(hand_patches(8))
     for module in network.modules():
-        if isinstance(module, torch.nn.BatchNorm2d):
+        if isinstance(module, nn.BatchNorm1d | nn.BatchNorm2d):
             module.momentum = None  # the statistics are those of the next call
             module.train()
     network(patches)
@@ -51,6 +51,8 @@ def trained(architecture: str) -> torch.nn.Module:
     if architecture in ('hand_dense', 'two_looks'):
         for dense in (module for module in network.modules() if isinstance(module, HandDense)):
             dense.maps.weight.mul_(2)
+            if dense.refinement is not None:
+                nn.init.normal_(dense.refinement.output.weight, std=0.002)  # moved 5 mm, as in use
     else:
         for layer in (network.head.reconstruction or network.head.output,):
             layer.weight.mul_(0.7 / scale)

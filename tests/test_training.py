@@ -566,14 +566,15 @@ def test_a_network_starts_from_another_and_gets_a_prior_if_that_had_none(folder,
         tiny(folder, f'base={path}', out=tmp_path / 'third')
 
 
-def test_a_network_with_further_blocks_starts_as_the_one_it_grew_from(folder, tmp_path):
+def test_a_network_with_further_blocks_and_a_refinement_starts_as_the_one_it_grew_from(folder, tmp_path):
     facts, base = {'skeleton': 'icvl16', 'cube_side': 0.3}, tmp_path / 'base.safetensors'
     network = build('hand_dense', joints=16, width=8, bottleneck=8)
     for norm in (part for part in network.modules() if isinstance(part, nn.BatchNorm2d)):
         nn.init.uniform_(norm.weight, 0.5, 1)  # as after training: none is zero
     save_checkpoint(base, network, facts, half=False)
     wanted = ('network=hand_dense', 'options.width=8', f'base={base}')
-    run = tiny(folder, *wanted, 'options.blocks=[1,2,1,3]', 'samples=40', recipe='modern', out=tmp_path / 'grown')
+    run = tiny(folder, *wanted, 'options.blocks=[1,2,1,3]', 'options.refined=true', 'samples=40', recipe='modern',
+               out=tmp_path / 'grown')
     patch = run.shards.read(0)['patch'].float()
     with torch.no_grad():
         answers = [each.forward_full(patch) for each in (run.objective.network.eval(), load_checkpoint(base).network)]
@@ -582,6 +583,7 @@ def test_a_network_with_further_blocks_starts_as_the_one_it_grew_from(folder, tm
     run.train()
     grown = load_checkpoint(tmp_path / 'grown' / 'last.safetensors').network
     assert grown.config['blocks'] == [1, 2, 1, 3] and grown.stages[3][2].body[2][1].weight.abs().max() > 0
+    assert grown.config['refined'] and grown.refinement.output.weight.abs().max() > 0
     for other in ('options.blocks=[2,1,1]', 'options.blocks=[1,0,1,1]'):
         with pytest.raises(HandPoseError, match='give four numbers'):
             tiny(folder, *wanted, other, out=tmp_path / 'never')
@@ -602,7 +604,7 @@ def test_the_second_look_learns_behind_a_first_which_stays(folder, tmp_path):
     run = tiny(folder, *wanted, f'first={small}', f'base={large}', 'samples=40', recipe='modern', out=tmp_path / 'run')
     network, base = run.objective.network, load_checkpoint(large).network.state_dict()
     assert network.config['knuckles'] == (4, 7, 10, 13) and network.config['first'] == {
-        'width': 4, 'bottleneck': 8, 'blocks': [1, 1, 1, 1]}
+        'width': 4, 'bottleneck': 8, 'blocks': [1, 1, 1, 1], 'refined': False}
     second = network.second.state_dict()
     equal = {name for name in base if torch.equal(base[name], second[name])}
     assert all(name.startswith('head.') for name in base.keys() - equal) and len(equal) < len(base)

@@ -2,7 +2,7 @@
 
 The maps have 32 x 32 cells. For each joint a cell tells the direction to it and how close it is; the joint is the mean
 of the votes, weighted by closeness (the encoding of AWR, Huang et al. 2020, in cube units). With a bottleneck, the
-pose prior of the paper makes one hand of the joints.
+pose prior of the paper makes one hand of the joints; refined, each is moved by what is seen where it is now.
 """
 
 from __future__ import annotations
@@ -28,8 +28,9 @@ TOLD_SIZE = 0.19 / 0.30
 the tip of the middle finger."""
 SHARPNESS = 30.0
 """Weight of a vote: exp(SHARPNESS * closeness)."""
-FURTHER_BLOCK = re.compile(r'\bstages\.\d+\.[1-9]\d*\.')
-"""Finds, in the name of a weight, a block of a stage behind its first: it starts as the identity."""
+ADDED = re.compile(r'\bstages\.\d+\.[1-9]\d*\.|\brefinement\.')
+"""Finds, in the name of a weight, what starts as the identity, so that it can be added to a trained network: a block of
+a stage behind its first, and the refinement."""
 
 
 def cells(patch: Tensor) -> tuple[Tensor, Tensor]:
@@ -82,6 +83,7 @@ class HandDense(nn.Module):
         width: channels of the first stage; the cost grows with its square.
         bottleneck: coefficients of the pose prior behind the votes; None = the votes as they are.
         blocks: residual blocks of each stage.
+        refined: whether the joints are refined.
 
     Raises:
         HandPoseError: there are not four stages of at least one block.
@@ -90,11 +92,12 @@ class HandDense(nn.Module):
     outputs = ('joints', 'confidence', 'hand', 'side', 'size')
 
     def __init__(self, joints: int = 21, width: int = 32, bottleneck: int | None = None,
-                 blocks: Sequence[int] = (1, 1, 1, 1)) -> None:
+                 blocks: Sequence[int] = (1, 1, 1, 1), refined: bool = False) -> None:
         super().__init__()
         if len(blocks) != 4 or min(blocks) < 1:
             raise HandPoseError(f'blocks {list(blocks)}: give four numbers, each at least 1')
-        self.joints, self.width, self.bottleneck, self.blocks = joints, width, bottleneck, list(blocks)
+        self.joints, self.width, self.bottleneck, self.blocks, self.refined = (
+            joints, width, bottleneck, list(blocks), refined)
         w = width
         self.stem = nn.Sequential(conv_norm(1, w, 5, stride=2), nn.ReLU(), nn.MaxPool2d(2))
         self.stages = nn.ModuleList()
@@ -106,6 +109,7 @@ class HandDense(nn.Module):
         self.maps = nn.Conv2d(2 * w, 4 * joints, 1)
         self.summary = plain_linear(8 * w + joints, joints + 3)
         self.head = PriorOverVotes(joints, bottleneck) if bottleneck else None
+        self.refinement = JointRefinement(joints, 3 * w, 8 * w) if refined else None
         nn.init.normal_(self.maps.weight, std=0.01)
         nn.init.zeros_(self.maps.bias)  # type: ignore[arg-type]
 
@@ -124,31 +128,38 @@ class HandDense(nn.Module):
 
         joints (B, J, 3) in cube units; logits: confidence (B, J) that a joint is right, hand (B,) that this is one,
         side (B,) that it is a right hand; size (B,), the logarithm of the hand's size over the usual one; and for the
-        loss votes (B, J, 3), the joints before the prior, positions (B, 3, 32, 32), seen (B, 1, 32, 32),
-        directions (B, J, 3, 32, 32), closeness (B, J, 32, 32).
+        loss votes (B, J, 3), the joints before the prior, unrefined (B, J, 3), those before the refinement,
+        positions (B, 3, 32, 32), seen (B, 1, 32, 32), directions (B, J, 3, 32, 32), closeness (B, J, 32, 32).
         """
-        x, fused = pyramid(self.stem(patch), self.stages, self.laterals)  # (B, 8w, 4, 4) and (B, 2w, 32, 32)
+        features, fused = pyramid(self.stem(patch), self.stages, self.laterals)
+        fused = self.fuse(fused)  # (B, 2w, 32, 32)
         # Sums over a thousand cells need more than a half, and run along the cells whatever convolutions prefer.
-        maps = self.maps(self.fuse(fused)).float().contiguous()
+        maps = self.maps(fused).float().contiguous()
         directions = maps[:, :3 * self.joints].unflatten(1, (self.joints, 3))
         closeness = maps[:, 3 * self.joints:]
         positions, seen = cells(patch.float())
         with torch.autocast(patch.device.type, enabled=False):  # nor may training in half precision halve them
             votes, agreement = decode(positions, seen, directions, closeness)
-        summary = self.summary(torch.cat([x.mean(dim=(2, 3)), agreement.to(x.dtype)], dim=1))
+        whole = features[-1].mean(dim=(2, 3))  # (B, 8w)
+        summary = self.summary(torch.cat([whole, agreement.to(whole.dtype)], dim=1))
         confidence = summary[:, :self.joints]
         with torch.autocast(patch.device.type, enabled=False):
             # The confidence is to say how sure a joint is, not to be bent into what serves the prior.
-            joints = votes if self.head is None else self.head(votes, confidence.detach())
+            unrefined = votes if self.head is None else self.head(votes, confidence.detach())
+            joints = unrefined
+            if self.refinement is not None:
+                local = torch.cat([fused, features[0]], dim=1)
+                joints = self.refinement(unrefined, votes, confidence.detach(), local, whole)
         return {
             'joints': joints, 'confidence': confidence,
             **dict(zip(('hand', 'side', 'size'), summary[:, self.joints:].unbind(1), strict=True)),
-            'votes': votes, 'positions': positions, 'seen': seen, 'directions': directions, 'closeness': closeness,
+            'votes': votes, 'unrefined': unrefined,
+            'positions': positions, 'seen': seen, 'directions': directions, 'closeness': closeness,
         }
 
 
-def pyramid(x: Tensor, stages: nn.ModuleList, laterals: nn.ModuleList) -> tuple[Tensor, Tensor]:
-    """What the last of the stages sees, each of which but the first halves the size; and the sum of what all of them
+def pyramid(x: Tensor, stages: nn.ModuleList, laterals: nn.ModuleList) -> tuple[list[Tensor], Tensor]:
+    """What each of the stages sees, each of which but the first halves the size; and the sum of what all of them
     see, each through its lateral, as large as the first (feature pyramid, Lin et al. 2017)."""
     features = []
     for stage in stages:
@@ -157,7 +168,66 @@ def pyramid(x: Tensor, stages: nn.ModuleList, laterals: nn.ModuleList) -> tuple[
     fused = laterals[-1](x)
     for lateral, feature in zip(laterals[-2::-1], features[-2::-1], strict=True):
         fused = F.interpolate(fused, scale_factor=2, mode='nearest') + lateral(feature)
-    return x, fused
+    return features, fused
+
+
+class JointRefinement(nn.Module):
+    """Joints are moved by what is seen where they are: the refinement of the paper (3.3), but that it looks at features
+    which are there already, and at all joints at once, so that what is seen at one can move another.
+
+    Args:
+        joints: J.
+        local: channels of the maps that are read where the joints are.
+        whole: features of the whole patch.
+    """
+
+    WIDTH = 64
+    HIDDEN = 256
+
+    def __init__(self, joints: int, local: int, whole: int) -> None:
+        super().__init__()
+        inputs = local + 7
+        self.norm, self.norm_whole = nn.BatchNorm1d(inputs), nn.BatchNorm1d(whole)
+        self.each = nn.Parameter(torch.randn(joints, inputs, self.WIDTH) * (2 / inputs) ** 0.5)
+        self.bias = nn.Parameter(torch.zeros(joints, 1, self.WIDTH))
+        self.all = nn.Linear(joints * self.WIDTH + whole, self.HIDDEN)
+        self.hidden = nn.Linear(self.HIDDEN, self.HIDDEN)
+        self.output = nn.Linear(self.HIDDEN, 3 * joints)
+        nn.init.zeros_(self.output.weight)
+        nn.init.zeros_(self.output.bias)
+
+    def forward(self, joints: Tensor, votes: Tensor, confidence: Tensor, local: Tensor, whole: Tensor) -> Tensor:
+        """Joints (B, J, 3) and the votes for them (B, J, 3) in cube units, logits (B, J) of how sure they are, maps
+        (B, C, H, W) and features of the whole patch (B, F) -> joints (B, J, 3)."""
+        dtype = self.all.weight.dtype
+        joints, votes, confidence, local, whole = (x.to(dtype) for x in (joints, votes, confidence, local, whole))
+        # Where to read is no output: maps learn from what was read, not from where else it could have been.
+        read = sample(local, joints[..., :2].detach())
+        x = self.norm(torch.cat([read, joints, votes, confidence[..., None]], dim=2).transpose(1, 2))
+        x = _active(torch.baddbmm(self.bias, x.permute(2, 0, 1), self.each)).transpose(0, 1)  # (B, J, WIDTH)
+        x = _active(self.all(torch.cat([x.flatten(1), self.norm_whole(whole)], dim=1)))
+        x = x + _active(self.hidden(x))
+        return joints + self.output(x).view_as(joints)
+
+
+def _active(x: Tensor) -> Tensor:
+    # While the output is still zero, plain rectified units die by the hundred and the refinement never begins.
+    return F.leaky_relu(x, 0.1)
+
+
+def sample(maps: Tensor, points: Tensor) -> Tensor:
+    """What maps (B, C, H, W) hold at points (B, N, 2), x and y in [-1, 1] from border to border: (B, N, C), bilinear.
+
+    Points beyond the middles of the outermost cells read fewer cells, and nothing from a cell beyond the border on.
+    """
+    shares = []
+    for axis, size in ((1, maps.shape[2]), (0, maps.shape[3])):
+        middles = (torch.arange(size, device=maps.device, dtype=maps.dtype) + 0.5) * (2 / size) - 1
+        at = points[..., axis, None].clamp(-1, 1)
+        shares.append((1 - (at - middles).abs() * (size / 2)).clamp(min=0))  # (B, N, H) and (B, N, W)
+    # As a product over all cells it is fast whatever the engine, and its gradient needs no scattering.
+    weights = (shares[0][..., None] * shares[1][:, :, None]).flatten(2)
+    return weights @ maps.flatten(2).transpose(1, 2)
 
 
 class Residual(nn.Module):

@@ -74,7 +74,7 @@ class TwoLooks(nn.Module):
     Args:
         joints: J.
         root, knuckles: a hand is upright when the mean of its knuckles is above its root; these are joints.
-        width, bottleneck, blocks: of the second look, see `HandDense`.
+        width, bottleneck, blocks, refined: of the second look, see `HandDense`.
         first: the same of the first, where they differ. It may be much smaller: it tells where to look, and no more.
 
     Raises:
@@ -84,13 +84,13 @@ class TwoLooks(nn.Module):
     outputs = HandDense.outputs
 
     def __init__(self, joints: int = 21, root: int = 0, knuckles: Sequence[int] = (5, 9, 13, 17), width: int = 32,
-                 bottleneck: int | None = None, blocks: Sequence[int] = (1, 1, 1, 1),
+                 bottleneck: int | None = None, blocks: Sequence[int] = (1, 1, 1, 1), refined: bool = False,
                  first: dict[str, Any] | None = None) -> None:
         super().__init__()
         if not all(0 <= joint < joints for joint in (root, *knuckles)) or not knuckles:
             raise HandPoseError(f'root {root} and knuckles {list(knuckles)} are not all among {joints} joints')
         self.joints, self.root, self.knuckles = joints, root, list(knuckles)
-        second: dict[str, Any] = {'width': width, 'bottleneck': bottleneck, 'blocks': blocks}
+        second: dict[str, Any] = {'width': width, 'bottleneck': bottleneck, 'blocks': blocks, 'refined': refined}
         self.first = HandDense(joints, **(first or second))
         self.first.requires_grad_(False).eval()
         self.second = HandDense(joints, **second)

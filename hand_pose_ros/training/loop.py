@@ -25,7 +25,7 @@ from hand_pose_ros.datasets.memory import keep_freed_memory
 from hand_pose_ros.datasets.shards import DiskShards, MemoryShards
 from hand_pose_ros.models import build
 from hand_pose_ros.models.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
-from hand_pose_ros.models.dense import FURTHER_BLOCK, HandDense
+from hand_pose_ros.models.dense import ADDED, HandDense
 from hand_pose_ros.models.prior import fit_prior
 from hand_pose_ros.models.two_looks import TwoLooks
 from hand_pose_ros.training.augmentation import PRESETS, augment
@@ -140,7 +140,7 @@ class Run:
         if recipe.network == 'two_looks':
             first = self._first_look(base)
             given |= {'root': self.skeleton.root, 'knuckles': self.skeleton.knuckles,
-                      'first': {key: getattr(first, key) for key in ('width', 'bottleneck', 'blocks')}}
+                      'first': {key: getattr(first, key) for key in ('width', 'bottleneck', 'blocks', 'refined')}}
         if taken := sorted(given.keys() & recipe.options.keys()):
             raise TrainingError(f'--set options.{taken[0]}: this follows from the dataset; leave it out')
         network = build(recipe.network, **given, **recipe.options)
@@ -171,8 +171,8 @@ class Run:
     def _start_from(self, network: nn.Module, base: Checkpoint) -> bool:
         """Take the weights of the base; False if it has none for the prior.
 
-        That it may lack, and further blocks of a stage, which start as the identity. The second of two looks may
-        start as any hand_dense, but that its prior is another.
+        That it may lack, and what starts as the identity: further blocks of a stage, and the refinement. The second
+        of two looks may start as any hand_dense, but that its prior is another.
         """
         own = base.network.state_dict()
         if isinstance(network, TwoLooks):
@@ -182,7 +182,7 @@ class Run:
         lacking = network.state_dict().keys() - own.keys()
         prior = {name for name in lacking if 'head' in name.split('.')}
         try:
-            if needed := [name for name in lacking - prior if not FURTHER_BLOCK.search(name)]:
+            if needed := [name for name in lacking - prior if not ADDED.search(name)]:
                 raise RuntimeError(f'{min(needed)} is missing')
             network.load_state_dict({**network.state_dict(), **own})
         except RuntimeError as error:

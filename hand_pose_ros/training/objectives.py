@@ -82,7 +82,7 @@ class DenseObjective(PoseObjective):
         """The loss of an answer to a batch whose joints (B, J, 3) are in units of the cube, or of one that
         is smaller by this factor (B,)."""
         counts, half = _counts(batch), batch['cube_side'] / 2 * scale
-        joints = out['joints'].float()
+        joints, refined = out['joints'].float(), out['unrefined'] is not out['joints']
         directions, closeness = encode(out['positions'], truth)
         seen = out['seen']  # (B, 1, 32, 32)
         apart = partial(F.smooth_l1_loss, reduction='none', beta=self.recipe.knee)
@@ -99,7 +99,8 @@ class DenseObjective(PoseObjective):
             'side': _binary(out['side'], ~batch['mirrored']) * batch['hand_present'],
             'size': F.smooth_l1_loss(out['size'].float(), size, reduction='none', beta=0.1) * counts,
         }
-        return {'joints': joint_loss(self.recipe.loss, self.recipe.knee, joints, truth, counts),
+        loss = partial(joint_loss, self.recipe.loss, self.recipe.knee, truth=truth, counts=counts)
+        return {'joints': loss(joints), **({'unrefined': loss(out['unrefined'].float())} if refined else {}),
                 **{name: _WEIGHTS[name] * value.mean() for name, value in extra.items()}}
 
     def _size(self, batch: Batch) -> Tensor:

@@ -9,7 +9,7 @@ from torch import nn
 
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.models import ARCHITECTURES, build
-from hand_pose_ros.models.dense import JointRefinement, cells, decode, encode, sample
+from hand_pose_ros.models.dense import JointRefinement, cells, decode, encode
 from hand_pose_ros.models.prior import fit_prior
 from hand_pose_ros.models.refiner import Refiner
 from hand_pose_ros.models.two_looks import View
@@ -330,13 +330,6 @@ def test_dense_cells_are_in_cube_units():
     torch.testing.assert_close(positions[0, :, 2, 30], torch.tensor([122 / 64 - 1, 10 / 64 - 1, -0.5]))
     assert seen.sum() == 1
     assert (positions[0, 2] == 1).sum() == 1023
-
-
-def test_maps_are_read_between_their_cells():
-    maps, points = torch.randn(2, 5, 32, 16), torch.rand(2, 7, 2) * 1.8 - 0.9
-    expected = F.grid_sample(maps, points[:, :, None], align_corners=False)[..., 0].transpose(1, 2)
-    torch.testing.assert_close(sample(maps, points), expected, atol=1e-5, rtol=0)
-    assert sample(maps, torch.full((2, 1, 2), 7.0)).isfinite().all()
 
 
 def test_a_refinement_starts_as_the_identity_and_learns_from_what_is_seen_at_the_joints():

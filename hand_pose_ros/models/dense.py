@@ -202,8 +202,10 @@ class JointRefinement(nn.Module):
         dtype = self.all.weight.dtype
         joints, votes, confidence, local, whole = (x.to(dtype) for x in (joints, votes, confidence, local, whole))
         # Where to read is no output: maps learn from what was read, not from where else it could have been.
-        read = sample(local, joints[..., :2].detach())
-        x = self.norm(torch.cat([read, joints, votes, confidence[..., None]], dim=2).transpose(1, 2))
+        places = joints[:, :, None, :2].detach().clamp(-1, 1)
+        read = F.grid_sample(local, places, align_corners=False)[..., 0]  # (B, C, J)
+        told = torch.cat([joints, votes, confidence[..., None]], dim=2)
+        x = self.norm(torch.cat([read, told.transpose(1, 2)], dim=1))
         x = _active(torch.baddbmm(self.bias, x.permute(2, 0, 1), self.each)).transpose(0, 1)  # (B, J, WIDTH)
         x = _active(self.all(torch.cat([x.flatten(1), self.norm_whole(whole)], dim=1)))
         x = x + _active(self.hidden(x))
@@ -213,21 +215,6 @@ class JointRefinement(nn.Module):
 def _active(x: Tensor) -> Tensor:
     # While the output is still zero, plain rectified units die by the hundred and the refinement never begins.
     return F.leaky_relu(x, 0.1)
-
-
-def sample(maps: Tensor, points: Tensor) -> Tensor:
-    """What maps (B, C, H, W) hold at points (B, N, 2), x and y in [-1, 1] from border to border: (B, N, C), bilinear.
-
-    Points beyond the middles of the outermost cells read fewer cells, and nothing from a cell beyond the border on.
-    """
-    shares = []
-    for axis, size in ((1, maps.shape[2]), (0, maps.shape[3])):
-        middles = (torch.arange(size, device=maps.device, dtype=maps.dtype) + 0.5) * (2 / size) - 1
-        at = points[..., axis, None].clamp(-1, 1)
-        shares.append((1 - (at - middles).abs() * (size / 2)).clamp(min=0))  # (B, N, H) and (B, N, W)
-    # As a product over all cells it is fast whatever the engine, and its gradient needs no scattering.
-    weights = (shares[0][..., None] * shares[1][:, :, None]).flatten(2)
-    return weights @ maps.flatten(2).transpose(1, 2)
 
 
 class Residual(nn.Module):

@@ -234,7 +234,7 @@ def fine_tune(network: nn.Module, recorded: Batch, synthetic: Batch, steps: int,
             batch['patch'] = batch['patch'].float()
             batch = augment(batch, replace(recipe.augmentation, mirror=mirror), numbers, seed=len(terms))
             terms.append(objective(batch))
-        learned = [terms[0][name] for name in ('joints', 'maps') if name in terms[0]]
+        learned = [terms[0][name] for name in ('joints', 'unrefined', 'maps') if name in terms[0]]
         loss = torch.stack([*learned, *terms[1].values()]).sum()
         optimizer.zero_grad(set_to_none=True)
         loss.backward()

@@ -29,6 +29,8 @@ def generate_launch_description() -> LaunchDescription:
              parameters=[LaunchConfiguration('params_file'), {'use_sim_time': LaunchConfiguration('use_sim_time')}],
              remappings=[('depth/image_rect', LaunchConfiguration('depth_topic'))]),
         Node(package='rviz2', executable='rviz2', arguments=['-d', str(SHARE / 'rviz' / 'hand_pose.rviz')],
+             namespace=LaunchConfiguration('namespace'),
+             remappings=[('/hand/markers', 'hand/markers'), ('/depth/image_rect', LaunchConfiguration('depth_topic'))],
              parameters=[{'use_sim_time': LaunchConfiguration('use_sim_time')}],
              condition=IfCondition(LaunchConfiguration('rviz'))),
     ])

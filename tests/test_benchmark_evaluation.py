@@ -53,3 +53,6 @@ def test_weights_for_other_joints_are_refused(tmp_path, capsys):
     with pytest.raises(SystemExit):
         main(['evaluate', 'synthetic-test-v1', '--side', 'left'])
     assert '--side is for bags' in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(['evaluate', 'synthetic-test-v1', '--depth-scale', '0.0001'])
+    assert '--depth-scale is for bags' in capsys.readouterr().err

@@ -139,7 +139,7 @@ def test_intrinsics_of_no_lens_are_refused(k: list[float]) -> None:
 
 def test_intrinsics_may_be_set_one_after_the_other() -> None:
     camera = Camera('/camera_info')
-    for some in ({'intrinsics_fx': 500.0}, {'intrinsics_fx': 500.0, 'intrinsics_fy': 510.0}):
+    for some in ({'intrinsics_fx': 500.0}, {'intrinsics_fx': 500.0, 'intrinsics_fy': 510.0}, {'intrinsics_cx': -3.0}):
         with pytest.raises(InputError, match='go together: set all four'):
             camera.intrinsics(640, 480, Params(**some))
     both = Params(intrinsics_fx=500.0, intrinsics_fy=510.0, intrinsics_cx=320.0, intrinsics_cy=240.0)

@@ -12,14 +12,14 @@ pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
 
 from hand_pose_ros.bags import BagWriter
 from hand_pose_ros.cli import main
-from hand_pose_ros.cli.demo import summarise
+from hand_pose_ros.cli.demo import _truth, summarise
 from hand_pose_ros.estimator import HandEstimate
 from hand_pose_ros.geometry import Cube, Intrinsics
 from hand_pose_ros.models import build
 from hand_pose_ros.models.checkpoints import save_checkpoint
 from hand_pose_ros.msg import HandJointsArray
 from hand_pose_ros.ros.live import Answers
-from hand_pose_ros.skeleton import HAND21
+from hand_pose_ros.skeleton import HAND21, get_skeleton
 
 COUNT = 6
 
@@ -77,6 +77,9 @@ def test_an_image_without_an_answer_is_counted(monkeypatch: pytest.MonkeyPatch, 
     summary = summarise([1, 2], answers, {1: []}, {})
     assert (summary['frames_in'], summary['frames_answered'], summary['frames_with_a_hand']) == (2, 1, 0)
     assert summary['latency_p50_ms'] == pytest.approx(12) and summary['joint_error_mean_mm'] is None
+    write_bag(tmp_path / 'truth.mcap')
+    assert len(_truth(tmp_path / 'truth.mcap', HAND21)) == COUNT
+    assert not _truth(tmp_path / 'truth.mcap', get_skeleton('msra21'))  # as many joints, but others
 
     write_bag(tmp_path / 'hand.mcap')
     monkeypatch.setattr('hand_pose_ros.ros.live.play_through_node', lambda *_, **__: answers)

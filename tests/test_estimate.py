@@ -1,5 +1,6 @@
 """What `hand-pose estimate` promises: every usable image answered, in files that hold what the estimator said."""
 
+import shutil
 import sys
 from types import SimpleNamespace
 
@@ -159,6 +160,15 @@ def test_what_comes_before_the_damage_of_a_bag_counts(tmp_path, bag, command, ca
     assert command(tmp_path / 'cut.mcap', '--out', tmp_path / 'joints.npz') == 1
     assert 0 < len(np.load(tmp_path / 'joints.npz')['names']) < 60
     assert 'cut.mcap: the bag was cut short' in capsys.readouterr().err
+
+
+def test_the_folder_of_a_bag_may_lack_its_metadata(tmp_path, bag, command, capsys):
+    (tmp_path / 'recording').mkdir()
+    shutil.copy(bag, tmp_path / 'recording' / 'recording_0.mcap')
+    assert command(tmp_path / 'recording', '--out', tmp_path / 'joints.npz') == 0
+    (tmp_path / 'empty').mkdir()
+    assert command(tmp_path / 'empty', '--out', tmp_path / 'never.npz') == 1
+    assert 'neither 16-bit depth .png files nor a bag' in capsys.readouterr().err
 
 
 def test_nothing_usable_writes_nothing(tmp_path, command, capsys):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from hand_pose_ros.bags import Bag, BagWriter, read_hands
+from hand_pose_ros.bags import Bag, BagWriter, DepthBag, read_hands
 from hand_pose_ros.cli import main
 from hand_pose_ros.cli.evaluate import _names
 from hand_pose_ros.cli.hand_bag import HandBag
@@ -25,7 +25,7 @@ from hand_pose_ros.files import in_one_step
 from hand_pose_ros.geometry import Cube, Intrinsics
 from hand_pose_ros.models import build
 from hand_pose_ros.models.checkpoints import save_checkpoint
-from hand_pose_ros.skeleton import HAND21
+from hand_pose_ros.skeleton import HAND21, get_skeleton
 
 CAMERA = Intrinsics(240, 240, 159.5, 119.5, 320, 240)
 FRAMES, STEP_NS = 12, 33_000_000
@@ -121,6 +121,19 @@ def test_truth_from_a_topic_a_file_or_text_gives_the_same_error(tmp_path, model,
     assert Result.load(tmp_path / 'r.npz').summary()['mean_mm'] == got['mean_mm']
 
 
+def test_truth_of_other_joints_or_in_another_frame_is_refused(tmp_path, model, result, capsys):
+    hand = HandEstimate(result.predictions[0].astype(np.float32), HAND21.joint_names, np.ones(21, np.float32), 1.0,
+                        'right', Cube((0, 0, 0.5), 0.3), 'a')
+    for k, (skeleton, frame, message) in enumerate((
+            (get_skeleton('msra21'), 'camera', 'has joints of msra21, but the estimator gives those of hand21'),
+            (HAND21, 'base_link', "its joints are in frame 'base_link', but the images in 'camera'"))):
+        with BagWriter(tmp_path / f'{k}.mcap') as bag:
+            bag.write_depth(10**9, 'camera', depth_image(0), CAMERA, codec=None)
+            bag.write_hands(10**9, frame, [hand], skeleton, '/truth/joints')
+        assert main(arguments(tmp_path / f'{k}.mcap', model, '--ground-truth', '/truth/joints')) == 1
+        assert message in capsys.readouterr().err
+
+
 def test_truth_that_does_not_fit_is_refused(tmp_path, bag, model, result, capsys, monkeypatch):
     np.savez(tmp_path / 'few.npz', joints=result.predictions[:3])
     np.savez(tmp_path / 'nyu.npz', joints=np.zeros((FRAMES, 14, 3)))
@@ -195,9 +208,15 @@ def test_what_is_wrong_with_a_bag_is_said(tmp_path, model, capsys):
     assert main(arguments(two, model, '--depth-topic', '/left/depth')) == 0
     assert main(arguments(two, model, '--depth-topic', '/left/depth', '--out-bag', two)) == 1
     assert 'this is the input, which would be lost' in capsys.readouterr().err
-    with pytest.raises(SystemExit) as caught:
-        main(['evaluate', 'bag.mcap', '--via-ros', '--out-bag', 'x.mcap'])
-    assert caught.value.code == 2
+    assert main(arguments(two, model, '--depth-topic', '/left/depth', '--json', two)) == 1
+    assert 'this is the input, which would be lost' in capsys.readouterr().err
+    for more in (('bag.mcap', '--via-ros', '--out-bag', 'x.mcap'), (str(two), '--out', str(two)),
+                 (str(two), '--out', 'result'), (str(two), '--dataset', 'nyu'),
+                 ('--predictions', 'p.txt', '--ground-truth', 'g.txt', '--dataset', 'nyu', '--model', model)):
+        with pytest.raises(SystemExit) as caught:
+            main(['evaluate', *more])
+        assert caught.value.code == 2
+    assert DepthBag(two, depth_topic='/left/depth')
 
 
 def test_real_bags_without_camera_info_need_intrinsics(shared_data, model, capsys):

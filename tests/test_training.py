@@ -482,6 +482,11 @@ def test_two_processes_give_the_result_of_one(folder, tmp_path):
         torch.testing.assert_close(two[key], value, atol=1e-5, rtol=1e-4)
 
 
+def test_a_device_that_is_not_there_is_told_before_the_work(folder, tmp_path):
+    with pytest.raises(HandPoseError, match="device 'quantum' cannot be used here"):
+        tiny(folder, out=tmp_path, device='quantum')
+
+
 def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_batch(folder, tmp_path):
     run = tiny(folder, 'learning_rate=1e30', out=tmp_path)
     with pytest.raises(TrainingError, match=r'step \d+ is not finite .* learning_rate below 1e\+30'):
@@ -496,6 +501,10 @@ def test_a_refiner_learns_from_what_its_base_has_not_seen(folder, tmp_path):
         tiny(folder, 'refiner=or_ref', f'base={tmp_path / "greedy" / "last.safetensors"}', out=tmp_path / 'never')
     tiny(folder, 'last_shard=2', out=tmp_path / 'base').train()
     base = tmp_path / 'base' / 'last.safetensors'
+    with pytest.raises(TrainingError, match='choose one of std_ref, or_ref'):
+        tiny(folder, 'refiner=deep', f'base={base}', out=tmp_path / 'never')
+    with pytest.raises(TrainingError, match=r'gives joints of hand21, but icvl has those of icvl16'):
+        tiny(folder, 'refiner=or_ref', 'base=deep_prior', out=tmp_path / 'never')
     run = tiny(folder, 'refiner=or_ref', f'base={base}', 'optimizer=adamw', 'learning_rate=0.001', 'samples=160',
                out=tmp_path / 'refined')
     assert list(run.stream.window(0)) == [2, 3]
@@ -601,6 +610,8 @@ def test_the_second_look_learns_behind_a_first_which_stays(folder, tmp_path):
     for base in ('none', large):
         with pytest.raises(TrainingError, match='--set first=FILE'):
             tiny(folder, *wanted, f'base={base}', out=tmp_path / 'never')
+    with pytest.raises(TrainingError, match='hand_dense has one look'):
+        tiny(folder, 'network=hand_dense', *wanted[1:], f'first={small}', out=tmp_path / 'never')
     run = tiny(folder, *wanted, f'first={small}', f'base={large}', 'samples=40', recipe='modern', out=tmp_path / 'run')
     network, base = run.objective.network, load_checkpoint(large).network.state_dict()
     assert network.config['knuckles'] == (4, 7, 10, 13) and network.config['first'] == {

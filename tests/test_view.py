@@ -95,6 +95,14 @@ def test_a_failure_leaves_no_file_and_is_one_sentence(tmp_path, bag, weights, ca
     assert not list(tmp_path.glob('*.rrd*')) and not list(tmp_path.glob('.*rrd*'))
 
 
+def test_options_that_say_nothing_are_refused(bag, capsys):
+    for more, message in ((('--depth-topic', '/cam/depth'), '--depth-topic is for bags'),
+                          ((str(bag), '--transport', 'compressed'), '--transport is for live topics')):
+        with pytest.raises(SystemExit):
+            main(['view', *more])
+        assert message in capsys.readouterr().err
+
+
 def test_live(tmp_path, weights, ros_domain):
     pytest.importorskip('rclpy', reason='needs ROS 2')
     pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
@@ -110,8 +118,9 @@ def test_live(tmp_path, weights, ros_domain):
                   and rig.client.count_subscribers('/hand/joints') == 2, 'the viewer', seconds=90)
         answers = {}
         for i in range(200):  # best effort: the first images may not reach it
-            hand = rig.answer(publish, image(depth_with_hand(), 1000 + 33 * i)).hands[0]
-            answers[(1000 + 33 * i) * 1_000_000] = [(p.x, p.y, p.z) for p in hand.joints]
+            hands = rig.answer(publish, image(depth_with_hand(), 1000 + 33 * i)).hands
+            answers[(1000 + 33 * i) * 1_000_000] = {
+                hand.id: [(p.x, p.y, p.z) for p in hand.joints] for hand in hands}
             if i >= 20 and any(part.stat().st_size > 100_000 for part in tmp_path.glob('.live.rrd.*')):
                 break
         process.send_signal(signal.SIGINT)
@@ -120,7 +129,7 @@ def test_live(tmp_path, weights, ros_domain):
         process.kill()
         rig.close()
     images = recorded(out, '/camera/depth', 'DepthImage:buffer')
-    joints = recorded(out, f'/hands/{hand.id}/joints', 'Points3D:positions')
+    joints = recorded(out, f'/hands/{hands[0].id}/joints', 'Points3D:positions')
     assert images and joints and set(images) | set(joints) <= set(answers)
     for stamp, points in joints.items():
-        np.testing.assert_allclose(points, answers[stamp], atol=1e-6)
+        np.testing.assert_allclose(points, answers[stamp][hands[0].id], atol=1e-6)

@@ -202,6 +202,13 @@ def read_hands(path: str | os.PathLike[str], topic: str | None = None) -> list[R
         return [_recorded_hands(bag.deserialize(c, data), f'{path}: {topics[0]}') for c, _, data in bag.messages(found)]
 
 
+def check_frame(source: str, hands: str, images: str) -> None:
+    """Raise InputError if hands are told in another frame than their images are; a frame without a name may be any."""
+    if hands and images and hands != images:
+        raise InputError(f"{source}: its joints are in frame '{hands}', but the images in '{images}': leave the "
+                         'target_frame of the node empty, and it publishes them where the camera sees them')
+
+
 def _recorded_hands(message: Any, source: str) -> RecordedHands:
     counts = {count for hand in message.hands for count in (len(hand.joints), len(hand.confidence))}
     if len(counts) > 1:

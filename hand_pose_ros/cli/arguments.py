@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +49,13 @@ def keep_input(output: str | Path | None, source: str | Path) -> None:
         raise HandPoseError(f'{output}: this is the input, which would be lost: choose another place')
 
 
+def refuse(args: argparse.Namespace, names: Iterable[str], why: str) -> None:
+    """Refuse options that were given, but are not for what is to be done; `args.parser` is the parser."""
+    for name in names:
+        if getattr(args, name) != args.parser.get_default(name):
+            args.parser.error(f'--{name.replace("_", "-")} {why}')
+
+
 def add_bag(parser: Any) -> None:
     """How depth is read from a bag."""
     parser.add_argument('--depth-topic', metavar='TOPIC', help='needed if several topics carry depth')
@@ -70,6 +78,12 @@ def bag_options(args: argparse.Namespace) -> dict[str, Any]:
     check_intrinsics(args)
     return {'depth_topic': args.depth_topic, 'camera_info_topic': args.camera_info_topic,
             'intrinsics': args.intrinsics and tuple(args.intrinsics), 'depth_scale': args.depth_scale}
+
+
+BAG = ('depth_topic', 'camera_info_topic', 'intrinsics', 'depth_scale')
+"""What `add_bag` adds."""
+ESTIMATOR = ('model', 'device', 'side', 'detector', 'cube_size', 'min_score')
+"""What `add_estimator` adds."""
 
 
 def add_estimator(parser: Any) -> None:

@@ -16,7 +16,7 @@ from hand_pose_ros.errors import InputError
 from hand_pose_ros.files import in_one_step, write_bytes, write_json
 from hand_pose_ros.hand import HandEstimate
 from hand_pose_ros.resources import resource
-from hand_pose_ros.skeleton import get_skeleton
+from hand_pose_ros.skeleton import Skeleton, get_skeleton
 
 if TYPE_CHECKING:
     from hand_pose_ros.ros.live import Answers
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
         frames = list(bag)
     pictures = [overlay(frame.depth, frame.intrinsics, hands.get(frame.stamp_ns, []), skeleton, ANIMATION_HEIGHT)
                 for frame in frames]
-    summary = summarise([frame.stamp_ns for frame in frames], answers, hands, _truth(path))
+    summary = summarise([frame.stamp_ns for frame in frames], answers, hands, _truth(path, skeleton))
     args.out.mkdir(parents=True, exist_ok=True)
     chosen = np.linspace(0, len(pictures) - 1, min(SHEET_PICTURES, len(pictures))).round().astype(int)
     sheet = contact_sheet([pictures[i] for i in chosen], 3)
@@ -101,9 +101,10 @@ def summarise(stamps: Sequence[int], answers: Answers, hands: dict[int, list[Han
     }
 
 
-def _truth(path: Path) -> dict[int, RecordedHands]:
+def _truth(path: Path, skeleton: Skeleton) -> dict[int, RecordedHands]:
+    """By stamp, where it is of the same joints."""
     try:
-        return {hands.stamp_ns: hands for hands in read_hands(path, TRUTH_TOPIC)}
+        return {hands.stamp_ns: hands for hands in read_hands(path, TRUTH_TOPIC) if hands.skeleton == skeleton.name}
     except InputError:
         return {}  # a bag of a real camera
 

@@ -13,7 +13,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
-from hand_pose_ros.cli.arguments import add_bag, add_estimator, bag_options, count, estimator_options, keep_input
+from hand_pose_ros.cli.arguments import (
+    ESTIMATOR,
+    add_bag,
+    add_estimator,
+    bag_options,
+    count,
+    estimator_options,
+    keep_input,
+    refuse,
+)
 from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.evaluation import published
 from hand_pose_ros.evaluation.results import Result
@@ -42,7 +51,7 @@ def add_parser(subparsers: Any) -> None:
         'evaluate', help='score a prediction file, or the estimator on a bag', epilog=EXAMPLES,
         description='Score predictions in a text file against labels, or run the estimator over bags and score it, or '
                     'only time it if there is no ground truth.', formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.set_defaults(error=parser.error)
+    parser.set_defaults(error=parser.error, parser=parser)
     parser.add_argument('bags', nargs='*', metavar='BAG', help='a ROS 1 file, a ROS 2 folder, '
                         'or an .mcap or .db3 file; or '
                         'synthetic-test-v1, the benchmark, which is made on the spot')
@@ -76,15 +85,22 @@ def run(args: argparse.Namespace) -> int:
     """Evaluate, print, and write what was asked for; 1 if a bag failed or was damaged."""
     if bool(args.bags) == bool(args.predictions):
         args.error('give either bags or --predictions')
+    if args.out and len(args.bags) < 2 and Path(args.out).suffix != '.npz':
+        args.error(f'--out {args.out}: the result is an .npz file')
     out = Path(args.out) / 'any.npz' if args.out and len(args.bags) > 1 else args.out
     for path in filter(None, (args.json, out, args.report and Path(args.report) / 'report.html')):
+        for source in args.bags:
+            keep_input(path, source)
         check_writable(path)  # now, not after minutes of work
     if args.predictions:
+        refuse(args, (*ESTIMATOR, 'depth_topic', 'camera_info_topic', 'depth_scale', 'out_bag', 'via_ros', 'jobs'),
+               'is for bags: these joints are estimated already')
         return _run_text(args)
+    refuse(args, ('dataset', 'depth_folder', 'protocol'), 'is for --predictions')
     if args.bags == ['synthetic-test-v1']:
-        for name in ('side', 'detector', 'cube_size', 'min_score', 'ground_truth', 'via_ros', 'out_bag'):
-            if getattr(args, name) not in (None, False, 'auto', 'network'):
-                args.error(f'--{name.replace("_", "-")} is for bags: crops, sides and truth are those of the benchmark')
+        refuse(args, ('side', 'detector', 'cube_size', 'min_score', 'ground_truth', 'depth_topic', 'camera_info_topic',
+                      'intrinsics', 'depth_scale', 'out_bag', 'via_ros', 'jobs'),
+               'is for bags: crops, sides and truth are those of the benchmark')
         from hand_pose_ros.evaluation.benchmark_evaluation import evaluate_benchmark
         others = [published.load_result(source) for source in args.compare]
         _deliver(args, evaluate_benchmark(args.model, args.device, progress=_progress('batches')), others, None)
@@ -150,7 +166,7 @@ def _evaluate_live(args: argparse.Namespace, settings: Settings) -> Result:
     skeleton = get_skeleton(load_checkpoint(args.model).metadata['skeleton'])
     truth = args.ground_truth and read_truth(args.ground_truth, args.bags[0], skeleton)
     with DepthBag(args.bags[0], **settings.bag) as bag:
-        intrinsics = next(iter(bag)).intrinsics
+        first = next(iter(bag))
         stamps = [frame.stamp_ns for frame in bag]
         answers = play_through_node(bag, args.camera_info_topic,
                                     {name: value for name, value in parameters.items() if value is not None})
@@ -163,11 +179,11 @@ def _evaluate_live(args: argparse.Namespace, settings: Settings) -> Result:
     dropped = sum(stamp not in answers.hands for stamp in stamps)
     notes = (f'{dropped} of {len(stamps)} images got no answer from the node and count as images without a hand.',)
     result = Result(
-        Path(args.bags[0]).stem, skeleton, intrinsics, joints, stamps_ns=np.array(stamps),
+        Path(args.bags[0]).stem, skeleton, first.intrinsics, joints, stamps_ns=np.array(stamps),
         seconds={'image to joints': latency}, notes=notes if dropped else (), info={
             'bag': args.bags[0], 'depth_topic': topic, 'model': args.model or 'default', 'device': args.device,
             'via_ros': True, 'dropped': dropped, 'damaged': False})
-    return with_truth(result, truth) if truth else result
+    return with_truth(result, truth, first.frame_id) if truth else result
 
 
 def _run_bags(args: argparse.Namespace) -> int:

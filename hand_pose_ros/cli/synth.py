@@ -164,7 +164,9 @@ def _write(args: argparse.Namespace) -> None:
     from tqdm import tqdm
 
     from hand_pose_ros.files import in_one_step
+    from hand_pose_ros.runtime import check_device
 
+    check_device(args.device)
     hands = _hands(args, args.sensors, device=args.device)
     args.out.mkdir(parents=True, exist_ok=True)
     for indices in tqdm(list(_indices(args.start, args.number, args.shard)), unit='shard', disable=None):

@@ -14,7 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hand_pose_ros.bags import DepthBag
-from hand_pose_ros.cli.arguments import add_bag, add_estimator, bag_options, count, estimator_options, keep_input
+from hand_pose_ros.cli.arguments import (
+    BAG,
+    ESTIMATOR,
+    add_bag,
+    add_estimator,
+    bag_options,
+    count,
+    estimator_options,
+    keep_input,
+    refuse,
+)
 from hand_pose_ros.cli.estimate import from_bag
 from hand_pose_ros.depth import to_units
 from hand_pose_ros.errors import HandPoseError, InputError
@@ -39,10 +49,11 @@ def add_parser(subparsers: Any) -> None:
         'view', help='depth images and hands in 3D, live or from a bag', epilog=_EXAMPLES,
         description='Show depth images and hands in 3D with Rerun: those of a bag, or of live topics.',
         formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.set_defaults(parser=parser)
     parser.add_argument('bag', metavar='BAG', type=Path, nargs='?', help='a .bag, .mcap or .db3 file, or a ROS 2 '
                         'folder: its hands are estimated; without it, live topics are shown')
     parser.add_argument('--save', metavar='FILE', type=Path, help='write an .rrd file instead of opening the viewer')
-    bag = parser.add_argument_group('with a bag')
+    bag = parser.add_argument_group('with a bag (live, --depth-scale alone)')
     add_bag(bag)
     add_estimator(bag)
     bag.add_argument('--max-hands', type=count, default=2, metavar='N', help='at most N hands per image (2)')
@@ -60,7 +71,10 @@ def run(args: argparse.Namespace) -> int:
         HandPoseError: Rerun is not installed, there is no ROS to be live with, or the bag cannot be read.
     """
     if args.bag is not None:
+        refuse(args, ('transport', 'ros_args'), 'is for live topics')
         return _view_bag(args)
+    refuse(args, (*(name for name in BAG if name != 'depth_scale'), *ESTIMATOR, 'max_hands'),
+           'is for bags: which live topics are shown is said by --ros-args -r from:=to')
     from hand_pose_ros.ros.watch import watch  # says what is missing where there is no ROS
     with Scene(args.save) as scene:
         watch(scene.add_depth, scene.add_hands, args.transport, args.depth_scale or 0.001, args.ros_args)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from hand_pose_ros.bags.reader import DepthBag, Frame, RecordedHands, read_hands
+from hand_pose_ros.bags.reader import DepthBag, Frame, RecordedHands, check_frame, read_hands
 from hand_pose_ros.datasets.base import DatasetError, LabelledFrame, RecordedDataset, fingerprint
 from hand_pose_ros.skeleton import Skeleton, get_skeleton
 
@@ -43,6 +43,7 @@ class Bags(RecordedDataset):
     def frame(self, index: int) -> LabelledFrame:
         bag, hands, i = self._samples[index]
         frame = self._image(bag, hands.stamp_ns)
+        check_frame(f'bags: {bag}', hands.frame_id, frame.frame_id)
         joints = hands.joints[i]
         return LabelledFrame(frame.depth, frame.intrinsics, joints, joints.mean(0), self.cube_side,
                              hands.sides[i] == 'left')

@@ -112,7 +112,7 @@ def evaluate_bag(path: str | Path, settings: Settings, progress: Progress | None
         seconds={stage: np.array(record.seconds[stage]) for stage in sorted(record.seconds, key=_stage_order)},
         info={'bag': str(path), 'depth_topic': bag.depth_topic, 'model': str(settings.model or DEFAULT),
               'engine': estimator.engine.name, 'frames_per_s': round(rate, 1), 'damaged': damaged})
-    return with_truth(result, truth) if truth else result
+    return with_truth(result, truth, record.frame_id) if truth else result
 
 
 def evaluate_bags(paths: Sequence[str | Path], settings: Settings, jobs: int | None = None,
@@ -178,6 +178,7 @@ class _Record:
         self.seconds: dict[str, list[float]] = {}
         self.failures: list[str] = []
         self.intrinsics: Intrinsics | None = None
+        self.frame_id = ''
 
     def add(self, image: _Image) -> list[HandEstimate]:
         """Estimate the hands of an image, and keep them and the time it took."""
@@ -196,6 +197,7 @@ class _Record:
         for stage in times.keys() | self.seconds.keys():
             self.seconds.setdefault(stage, [np.nan] * len(self.stamps)).append(times.get(stage, np.nan))
         self.stamps.append(image.frame.stamp_ns)
+        self.frame_id = image.frame.frame_id
         self.joints.append(hands[0].joints.astype(np.float64) if hands
                            else np.full((len(self._estimator.skeleton), 3), np.nan))
         return hands

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hand_pose_ros.bags import read_hands
+from hand_pose_ros.bags import check_frame, read_hands
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.evaluation.published import Labels, read_text
 from hand_pose_ros.evaluation.results import DAMAGE, Result
@@ -27,11 +27,13 @@ class Truth:
     Attributes:
         joints: (M, J, 3) metres, optical frame, or the labels of a text file, which only a camera turns into that.
         stamps_ns: (M,); None where the frames are those of the bag, in order.
+        frame_id: of the coordinates; empty if the source does not say.
     """
 
     source: str
     joints: Joints | Labels
     stamps_ns: NDArray[np.int64] | None = None
+    frame_id: str = ''
 
 
 def read_truth(source: str, bag: str | Path, skeleton: Skeleton) -> Truth:
@@ -54,12 +56,16 @@ def read_truth(source: str, bag: str | Path, skeleton: Skeleton) -> Truth:
     return truth
 
 
-def with_truth(result: Result, truth: Truth) -> Result:
+def with_truth(result: Result, truth: Truth, frame_id: str) -> Result:
     """The result of N images of a bag, with the true joints; images without a label get a note.
+
+    Args:
+        frame_id: of the images.
 
     Raises:
         InputError: the truth does not fit the images.
     """
+    check_frame(truth.source, truth.frame_id, frame_id)
     joints = truth.joints.points(result.intrinsics) if isinstance(truth.joints, Labels) else truth.joints
     if truth.stamps_ns is not None:
         joints = _match(truth.stamps_ns, joints, result, truth.source)
@@ -77,7 +83,7 @@ def _read(source: str, bag: str | Path, skeleton: Skeleton) -> Truth:
     if not Path(source).is_file():
         if not source.startswith('/'):
             raise InputError(f'{source}: there is no such file, and it is no topic either, which begins with /')
-        return _read_topic(source, bag)
+        return _read_topic(source, bag, skeleton)
     if Path(source).suffix != '.npz':
         return Truth(source, read_text(source, skeleton))
     try:
@@ -90,7 +96,7 @@ def _read(source: str, bag: str | Path, skeleton: Skeleton) -> Truth:
     return Truth(source, joints, stamps)
 
 
-def _read_topic(topic: str, bag: str | Path) -> Truth:
+def _read_topic(topic: str, bag: str | Path, skeleton: Skeleton) -> Truth:
     messages = [message for message in read_hands(bag, topic) if len(message.joints)]
     if not messages:
         raise InputError(f'{bag}: {topic} has no hand in any message, so there is nothing to compare with')
@@ -98,8 +104,12 @@ def _read_topic(topic: str, bag: str | Path) -> Truth:
         if len(message.joints) > 1:
             raise InputError(f'{bag}: {topic} has {len(message.joints)} hands at {message.stamp_ns} ns, but one hand '
                              'an image is evaluated: record one topic for each hand')
+        if message.skeleton != skeleton.name:
+            raise InputError(f'{bag}: {topic} has joints of {message.skeleton}, but the estimator gives those of '
+                             f'{skeleton.name}: take weights for {message.skeleton}')
+        check_frame(f'{bag}: {topic}', message.frame_id, messages[0].frame_id)
     return Truth(topic, np.stack([message.joints[0] for message in messages]).astype(np.float64),
-                 np.array([message.stamp_ns for message in messages]))
+                 np.array([message.stamp_ns for message in messages]), messages[0].frame_id)
 
 
 def _match(stamps: NDArray[np.int64], joints: Joints, result: Result, source: str) -> Joints:

@@ -30,6 +30,8 @@ ARCHITECTURES: dict[str, Callable[..., nn.Module]] = {
     'std_ref': StdRef,
     'or_ref': ORRef,
 }
+REFINERS = ('std_ref', 'or_ref')
+"""Those that correct the joints of another network."""
 
 
 def build(architecture: str, **config: Any) -> nn.Module:

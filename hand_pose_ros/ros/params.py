@@ -105,7 +105,7 @@ class Params:
     @property
     def has_intrinsics(self) -> bool:
         """Whether the user gives the intrinsics. `ros2 param set` can only give them one after the other."""
-        return max(self.intrinsics_fx, self.intrinsics_fy) > 0
+        return any((self.intrinsics_fx, self.intrinsics_fy, self.intrinsics_cx, self.intrinsics_cy))
 
     def make_estimator(self) -> HandPoseEstimator:
         """Load the network, ready to answer.

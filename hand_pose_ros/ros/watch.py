@@ -12,6 +12,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from hand_pose_ros import ros
+from hand_pose_ros.bags import check_frame
 from hand_pose_ros.depth import decode_compressed, decode_image
 from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.estimator import HandEstimate
@@ -53,13 +54,15 @@ class _Watcher:
         self._on_depth, self._on_hands = on_depth, on_hands
         self._params = Params(transport=transport, depth_scale=depth_scale, camera_info_timeout=0.0)
         self._statistics = Statistics()
+        self._frame = ''
         self._topic, info_topic = topics.input_topics(self._node, transport)
         self._camera = Camera(info_topic)
         image_type, self._decode = (Image, decode_image) if transport == 'raw' else (CompressedImage, decode_compressed)
         topics.subscribe(self._node, CameraInfo, info_topic, self._camera.update, self._complain)
         topics.subscribe(self._node, image_type, self._topic, self._image, self._complain)
         self._node.create_subscription(HandJointsArray, 'hand/joints', self._hands, qos.RESULTS)
-        self._node.get_logger().info(f'showing {self._topic} and {self._node.resolve_topic_name("hand/joints")}')
+        self._hands_topic = self._node.resolve_topic_name('hand/joints')
+        self._node.get_logger().info(f'showing {self._topic} and {self._hands_topic}')
 
     def spin(self) -> None:
         executor = SingleThreadedExecutor()
@@ -70,6 +73,7 @@ class _Watcher:
             self._node.destroy_node()
 
     def _image(self, image: Any) -> None:
+        self._frame = image.header.frame_id
         try:
             depth = self._decode(image, self._params.depth_scale, source=self._topic)
             intrinsics = self._camera.intrinsics(depth.shape[1], depth.shape[0], self._params)
@@ -81,10 +85,10 @@ class _Watcher:
     def _hands(self, message: HandJointsArray) -> None:
         try:
             skeleton = get_skeleton(message.skeleton)
+            check_frame(self._hands_topic, message.header.frame_id, self._frame)
             hands = [hand_from_msg(hand, skeleton) for hand in message.hands]
         except HandPoseError as error:
-            self._complain(f'hands in frame {message.header.frame_id} cannot be shown ({error}): leave the parameter '
-                           'target_frame of the node empty')
+            self._complain(f'hands cannot be shown: {error}')
         else:
             self._on_hands(stamp_ns(message.header), hands, skeleton)
 

@@ -6,21 +6,24 @@ import copy
 import logging
 import os
 from collections.abc import Callable
+from typing import TypeVar
 
 import torch
 from torch import nn
 
 from hand_pose_ros.errors import HandPoseError
+from hand_pose_ros.models import REFINERS
 from hand_pose_ros.runtime.engine import Engine, Pipeline, TorchEngine
 from hand_pose_ros.runtime.lanes import fill_lanes
 from hand_pose_ros.runtime.onnx_engine import OnnxEngine
 
-__all__ = ['Engine', 'cores', 'default_threads', 'make_engine']
+__all__ = ['Engine', 'check_device', 'cores', 'default_threads', 'make_engine']
 
-NO_JOINTS = ('hand_finder', 'center_refiner', 'std_ref', 'or_ref')
+NO_JOINTS = ('hand_finder', 'center_refiner', *REFINERS)
 """Networks that are parts of something, or find hands."""
 
 _log = logging.getLogger(__name__)
+_T = TypeVar('_T')
 
 
 def cores() -> int:
@@ -68,16 +71,21 @@ def make_engine(network: nn.Module, device: str = 'auto', num_threads: int | Non
             raise HandPoseError(f"device '{device}' was asked for, but PyTorch {torch.__version__} finds no GPU: "
                                 "use 'cpu' or 'auto', or install a PyTorch for CUDA and its driver")
         from hand_pose_ros.runtime.cuda_engine import CudaEngine
-        engine = _on(device, CudaEngine, pipeline)
+        engine = _on(device, lambda: CudaEngine(pipeline, device))
     else:
-        engine = _on(device, TorchEngine, pipeline)
+        engine = _on(device, lambda: TorchEngine(pipeline, device))
     _log.info('runs on %s (%s)', engine.name, why)
     return engine
 
 
-def _on(device: str, kind: Callable[[Pipeline, str], Engine], pipeline: Pipeline) -> Engine:
+def check_device(device: str) -> None:
+    """Raise HandPoseError if PyTorch cannot work on a device."""
+    _on(device, lambda: torch.zeros(1, device=device))
+
+
+def _on(device: str, work: Callable[[], _T]) -> _T:
     try:
-        return kind(pipeline, device)
+        return work()
     except (RuntimeError, AssertionError) as error:  # either, depending on what the device lacks
         raise HandPoseError(f"device '{device}' cannot be used here ({str(error).splitlines()[0]}): "
-                            "use 'auto', 'cpu' or 'cuda'") from error
+                            "use 'cpu' or 'cuda'") from error

@@ -25,7 +25,7 @@ from hand_pose_ros.evaluation import plots
 from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.files import write_bytes, write_json
 from hand_pose_ros.geometry import Intrinsics
-from hand_pose_ros.models import build
+from hand_pose_ros.models import REFINERS, build
 from hand_pose_ros.models.checkpoints import Checkpoint, load_checkpoint
 from hand_pose_ros.models.prior import fit_prior
 from hand_pose_ros.skeleton import Skeleton, get_skeleton
@@ -187,7 +187,7 @@ def bottleneck(lab: Laboratory) -> str:
 def refinement(lab: Laboratory) -> str:
     """No refinement, StdRef and ORRef, and the number of iterations (the paper's right figures)."""
     results = [lab.result('deep-30', lab.network('deep', 30))]
-    for refiner in ('std_ref', 'or_ref'):
+    for refiner in REFINERS:
         results += lab.chain(f'deep-30 + {refiner}', lab.refined(refiner), ITERATIONS)
     twice = [results[0], *(result for result in results if result.name.endswith('x2'))]
     lab.write_results('refinement-curves', twice, plots.curves(twice))

@@ -23,11 +23,12 @@ from tqdm import tqdm
 from hand_pose_ros.datasets import Batch, open_dataset
 from hand_pose_ros.datasets.memory import keep_freed_memory
 from hand_pose_ros.datasets.shards import DiskShards, MemoryShards
-from hand_pose_ros.models import build
+from hand_pose_ros.models import REFINERS, build
 from hand_pose_ros.models.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from hand_pose_ros.models.dense import ADDED, HandDense
 from hand_pose_ros.models.prior import fit_prior
 from hand_pose_ros.models.two_looks import TwoLooks
+from hand_pose_ros.runtime import check_device
 from hand_pose_ros.training.augmentation import PRESETS, augment
 from hand_pose_ros.training.folder import RunFolder, TrainingError
 from hand_pose_ros.training.objectives import PoseObjective, RefinerObjective, objective_for
@@ -83,6 +84,7 @@ class Run:
         if machine.threads:
             torch.set_num_threads(machine.threads)
         self._stop = self._waiting = self._ending = False
+        check_device(machine.device)  # now, not after minutes of rendering
         self.device = torch.device(machine.device)
         if self.device.type == 'cuda' and 'LOCAL_RANK' in os.environ:
             self.device = torch.device('cuda', int(os.environ['LOCAL_RANK']))
@@ -91,6 +93,9 @@ class Run:
         self.base = load_checkpoint(recipe.base) if recipe.base else None
         self.shards = open_shards(recipe, machine, 'train', self.device)
         self.skeleton = self.shards.dataset.skeleton
+        if recipe.last_shard is not None and self.shards.dataset.size is None:
+            raise TrainingError(f'--set last_shard={recipe.last_shard} is for recorded datasets: {recipe.dataset} '
+                                'has no end; --set samples=N says how much of it is seen')
         self.stream = SampleStream(self.shards, recipe.batch_size, recipe.seed, recipe.reuse,
                                    self._first_shard(), recipe.last_shard, (self.rank, self.world))
         self.budget = recipe.samples or recipe.epochs * (self.stream.epoch_size or EPOCH_OF_ENDLESS_DATA)
@@ -128,7 +133,14 @@ class Run:
         if recipe.refiner:
             if base is None:
                 raise TrainingError('a refiner needs the checkpoint that it corrects: --set base=FILE')
+            if recipe.refiner not in REFINERS:
+                raise TrainingError(f'--set refiner={recipe.refiner}: choose one of {", ".join(REFINERS)}')
+            if base.metadata['skeleton'] != self.skeleton.name:
+                raise TrainingError(f'{recipe.base} gives joints of {base.metadata["skeleton"]}, but {recipe.dataset} '
+                                    f'has those of {self.skeleton.name}: a refiner needs a base of the same')
             return RefinerObjective(build(recipe.refiner, joints=joints), base.network, recipe, self.skeleton)
+        if recipe.first and recipe.network != 'two_looks':
+            raise TrainingError(f'--set first=FILE is for --set network=two_looks, and {recipe.network} has one look')
         of_joints = recipe.network not in ('center_refiner', 'hand_finder')
         if (recipe.network == 'hand_finder') != (recipe.dataset == 'scenes'):
             raise TrainingError(f'{recipe.network} cannot learn from {recipe.dataset}: hand_finder, and nothing else, '

@@ -28,12 +28,11 @@ import cv2
 import numpy as np
 
 from hand_pose_ros.files import write_json
-from hand_pose_ros.resources import resource
+from hand_pose_ros.ros import qos
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 570.0
 PROFILES = {'none': (False, False), 'camera': (True, False), 'node': (False, True), 'both': (True, True)}
 """Which processes have the profile: (camera, node)."""
-PROFILE_VARIABLES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
 COMMAND = [sys.executable, '-c', 'import sys; from hand_pose_ros.cli import main; sys.exit(main())']
 WARM_UP = 15
 """Images that are published first and do not count."""
@@ -72,9 +71,8 @@ def main() -> int:
 
 def environment(profile: bool) -> dict[str, str]:
     """This process's environment, with the profile or without any."""
-    variables = {name: value for name, value in os.environ.items() if name not in PROFILE_VARIABLES}
-    name = PROFILE_VARIABLES[os.environ.get('ROS_DISTRO') in ('humble', 'iron', 'jazzy')]
-    return variables | ({name: str(resource('config/fastdds_large_images.xml'))} if profile else {})
+    variables = {name: value for name, value in os.environ.items() if name not in qos.PROFILE_VARIABLES}
+    return variables | dict([qos.large_image_profile()] if profile else [])
 
 
 def hand_image() -> np.ndarray:

@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
 
+import rclpy
 from geometry_msgs.msg import PoseArray, TransformStamped
 from sensor_msgs.msg import Image, JointState, RegionOfInterest
 from std_msgs.msg import Header
@@ -43,6 +44,7 @@ from hand_pose_ros.ros.conversions import (
     prefixes,
     transforms_to_msgs,
 )
+from hand_pose_ros.ros.watch import _Watcher
 from hand_pose_ros.skeleton import HAND21
 
 pytestmark = pytest.mark.usefixtures('ros_domain')
@@ -261,3 +263,24 @@ def test_two_hands_keep_their_ids_whichever_is_nearer(rig: Rig) -> None:
     assert [hand.id for hand in one] == names[0][:1]
     back = rig.answer(publish, image(two_hands(0.64, 0.59), 1233)).hands
     assert len(back) == 2 and back[0].id == names[0][0] and back[1].id not in names[0]
+
+
+def test_hands_in_another_frame_are_not_shown_live():
+    rclpy.init()
+    try:
+        shown, said = [], []
+        watcher = _Watcher(lambda *_: None, lambda *hands: shown.append(hands), 'raw', 0.001)
+        watcher._complain = said.append
+        picture = image(depth_with_hand(), 1000)
+        watcher._image(picture)
+        message = HandJointsArray(header=picture.header, skeleton='hand21')
+        watcher._hands(message)
+        message.header.frame_id = 'base_link'
+        watcher._hands(message)
+        message.skeleton = 'paw'
+        watcher._hands(message)
+        watcher._node.destroy_node()
+    finally:
+        rclpy.try_shutdown()
+    assert len(shown) == 1
+    assert "in frame 'base_link', but the images in" in said[-2] and 'paw' in said[-1]

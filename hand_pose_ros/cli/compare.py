@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from hand_pose_ros.cli.arguments import count
 from hand_pose_ros.cli.evaluate import print_summaries
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.evaluation import metrics
@@ -41,7 +42,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('--dataset', choices=sorted(DATASETS), help='joints and camera of predictions that are text')
     parser.add_argument('--json', metavar='FILE', help='write all numbers there')
     parser.add_argument('--out', metavar='FOLDER', help='write report.html, and curves and bars as PNG and SVG, there')
-    parser.add_argument('--block', type=int, default=30, metavar='N',
+    parser.add_argument('--block', type=count, default=30, metavar='N',
                         help='frames that are drawn together in the bootstrap, because they err alike (default: 30)')
 
 
@@ -49,8 +50,6 @@ def run(args: argparse.Namespace) -> int:
     """Compare, print, and write what was asked for."""
     if len(args.results) < 2:
         args.error('give at least two results')
-    if args.block < 1:
-        args.error('--block must be at least 1')
     dataset = DATASETS[args.dataset] if args.dataset else None
     results = _named_apart([load_result(source, args.ground_truth, dataset) for source in args.results], args.results)
     for result in results:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 from hand_pose_ros.datasets import joints_in_metres
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.estimator import HandPoseEstimator
+from hand_pose_ros.evaluation.bag_evaluation import Progress
 from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.models.checkpoints import DEFAULT, load_checkpoint
@@ -24,8 +24,6 @@ NEAR_MM = 20.0
 BINS = np.linspace(0, 1, 11)
 THIRDS = 3
 """Of the joints: frames are told apart by how many are visible."""
-
-Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 
 
 def evaluate_benchmark(model: str | None = None, device: str = 'auto', frames: int = benchmark.FRAMES,

@@ -129,6 +129,15 @@ def test_only_the_ros_room_imports_ros(module: str) -> None:
     assert [name for name in imported_by(module) if ROS.match(name)] == []
 
 
+def test_every_ros_package_that_is_imported_is_a_dependency() -> None:
+    named = {tag.text for tag in ElementTree.parse(CHECKOUT / 'package.xml').getroot() if 'depend' in tag.tag}
+    modules = [*MODULES, *(str(path.relative_to(CHECKOUT)) for path in (CHECKOUT / 'launch').glob('*.py'))]
+    imported = {name.split('.')[0] for module in modules for name in imported_by(module) if ROS.match(name)}
+    imported -= {'hand_pose_ros'}
+    assert 'rclpy' in imported
+    assert {'tf2_ros_py' if name == 'tf2_ros' else name for name in imported} <= named
+
+
 @pytest.mark.parametrize('module', [module for module in MODULES if Path(module).with_suffix('').parts[1] in INNER])
 def test_imports_go_one_way(module: str) -> None:
     assert [name for name in imported_by(module) if OUTER.match(name)] == []

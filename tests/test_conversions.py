@@ -24,6 +24,7 @@ from hand_pose_ros.markers import HandMarkers
 from hand_pose_ros.resources import resource
 from hand_pose_ros.ros.camera import Camera
 from hand_pose_ros.ros.conversions import hand_from_msg, hands_to_msg, markers_to_msg, skeleton_to_msg, stamp_ns
+from hand_pose_ros.ros.diagnostics import Statistics
 from hand_pose_ros.ros.params import Params, markdown_table, yaml_file
 from hand_pose_ros.skeleton import HAND21
 
@@ -217,3 +218,20 @@ def test_the_launch_file_starts_the_node_with_its_parameter_file(monkeypatch: py
 def test_messages_hold_plain_arrays() -> None:
     """Slow lists would pass unnoticed: 21 confidences travel as one block."""
     assert isinstance(hands_to_msg(header(), [hand()], HAND21).hands[0].confidence, array)
+
+
+def test_lost_images_of_a_slow_camera_are_told() -> None:
+    def message(infos: int, images: int, published: bool = True) -> str:
+        statistics.count(camera_infos=infos, received=images, answered=images)
+        return str(statistics.report('node', 'active', published, {}).message)
+
+    statistics = Statistics()
+    assert 'but only' not in message(5, 1)  # too few to tell
+    assert '10 camera_info but only 2 images arrived' in message(5, 1)
+    assert 'but only' in message(5, 5)  # until there is better news
+    assert 'but only' not in message(5, 5)
+    statistics = Statistics()
+    assert 'but only' not in message(30, 29) + message(30, 0, published=False)
+    assert '30 camera_info but only 20' in message(30, 20)
+    statistics.count(received=10, answered=10)  # no camera_info any more: nothing to compare with
+    assert 'but only' not in str(statistics.report('node', 'active', True, {}).message)

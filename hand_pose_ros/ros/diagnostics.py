@@ -16,7 +16,7 @@ from hand_pose_ros.ros.topics import remedy_for_lost_images
 MAX_DROPPED = 0.2
 """A larger share of dropped or lost images is worth a warning."""
 MIN_SAMPLE = 10
-"""Fewer than this in a second tell nothing about shares."""
+"""Fewer than this tell nothing about shares."""
 REPEAT_S = 30.0
 """The same complaint is logged again after so long."""
 MAX_AGE_S = 10.0
@@ -48,6 +48,8 @@ class Statistics:
         self._lock = threading.Lock()
         self._window = _Window()
         self._totals: Counter[str] = Counter()
+        self._arriving: Counter[str] = Counter()
+        self._arrived: Counter[str] = Counter()
         self._logged_at: dict[str, float] = {}
 
     def count(self, **counts: int) -> None:
@@ -97,8 +99,9 @@ class Statistics:
             totals = dict(self._totals)
         elapsed = time.perf_counter() - window.since
         counts = window.counts
+        self._count_arrivals(counts if state == 'active' and published else Counter())
         level, message = ((DiagnosticStatus.ERROR, self.failure) if self.failure
-                          else _judge(window, state, published, self.silence))
+                          else _judge(window, state, self._arrived, self.silence))
         values = {'state': state, 'input_hz': f'{counts["received"] / elapsed:.1f}',
                   'output_hz': f'{counts["answered"] / elapsed:.1f}'}
         for stage, seconds in window.seconds.items():
@@ -111,17 +114,25 @@ class Statistics:
                                 values=[KeyValue(key=key, value=value) for key, value in values.items()])
 
 
-def _judge(window: _Window, state: str, published: bool, silence: str) -> tuple[bytes, str]:
+    def _count_arrivals(self, counts: Counter[str]) -> None:
+        """What arrived in one window or, of slow cameras, in several."""
+        if not counts['camera_infos']:
+            self._arriving, self._arrived = Counter(), Counter()
+        self._arriving.update({what: counts[what] for what in ('camera_infos', 'received')})
+        if self._arriving['camera_infos'] >= MIN_SAMPLE:
+            self._arrived, self._arriving = self._arriving, Counter()
+
+
+def _judge(window: _Window, state: str, arrived: Counter[str], silence: str) -> tuple[bytes, str]:
     """Level and message: the worst that happened."""
     counts = window.counts
     if window.problem:
         return DiagnosticStatus.WARN, window.problem
     if state != 'active':
         return DiagnosticStatus.OK, f'the node is {state}'
-    lost = counts['camera_infos'] >= MIN_SAMPLE and counts['received'] < (1 - MAX_DROPPED) * counts['camera_infos']
-    if lost and published:
-        return DiagnosticStatus.WARN, (f'{counts["camera_infos"]} camera_info but only {counts["received"]} images '
-                                       f'arrived in a second: if there should be as many, {remedy_for_lost_images()}')
+    if arrived['received'] < (1 - MAX_DROPPED) * arrived['camera_infos']:
+        return DiagnosticStatus.WARN, (f'{arrived["camera_infos"]} camera_info but only {arrived["received"]} images '
+                                       f'arrived: if there should be as many, {remedy_for_lost_images()}')
     if counts['received'] == 0:
         return DiagnosticStatus.STALE, silence or 'no images'
     # Where none was answered, they wait for something, like their camera_info, and that is said in its time.

@@ -184,7 +184,8 @@ class HandPoseEstimator:
         intrinsics.check_lens()
         self.timings = dict.fromkeys(('detect', 'crop', 'predict', 'uncrop'), 0.0)
 
-        dt = FRAME_S if time_s is None or self._last_s is None else time_s - self._last_s
+        # Two images of one time are of a driver that does not tell it.
+        dt = FRAME_S if time_s is None or self._last_s is None else time_s - self._last_s or FRAME_S
         self._last_s = time_s
 
         hands: list[HandEstimate] = []
@@ -241,7 +242,8 @@ class HandPoseEstimator:
             track.id = f'hand_{next(self._ids)}'
             self._tracks.append(track)
             hands.append(self._follow(track, reading, dt))
-            alarms = min(alarms, 1)
+            if self.tracking:  # else what comes next would never be looked at
+                alarms = min(alarms, 1)
 
     def _read(self, depth: NDArray[np.float32], intrinsics: Intrinsics, cube: Cube, track: _Track,
               hopeless: float = 0.0) -> _Reading:

@@ -75,6 +75,17 @@ def test_one_hand_keeps_its_name_until_reset(estimator, sequence):
     assert estimator(sequence[0].depth, sequence[0].intrinsics)[0].id not in names
 
 
+def test_images_that_do_not_tell_their_time_are_smoothed(sequence):
+    estimator = HandPoseEstimator.from_pretrained(device='cpu', smoothing=1.0, side='right')
+    raw = HandPoseEstimator.from_pretrained(device='cpu', side='right')
+    for time_s in (None, 7.0):
+        estimator.reset()
+        raw.reset()
+        moved = [np.abs(estimator(frame.depth, frame.intrinsics, time_s=time_s)[0].joints
+                        - raw(frame.depth, frame.intrinsics, time_s=time_s)[0].joints).max() for frame in sequence[:4]]
+        assert moved[0] == 0 and min(moved[1:]) > 1e-4
+
+
 @pytest.mark.parametrize('tilt', [0.0, 0.5], ids=['wall', 'table'])
 def test_a_hand_before_a_wall_or_over_a_table_is_found_and_followed(sequence, tilt):
     """The table comes nearer than the hand, at the lower edge of the image."""

@@ -267,6 +267,12 @@ def test_no_hand_is_an_empty_answer_and_takes_the_markers_away(rig: Rig) -> None
     rig.until(lambda: len(rig.received[MarkerArray]) > 2)
     assert rig.received[MarkerArray][2].markers == []  # and once is enough
 
+    rig.answer(publish, image(depth_with_hand(), 4))
+    assert rig.set_parameter('publish_markers', False)[0]
+    rig.answer(publish, image(depth_with_hand(), 5))
+    rig.until(lambda: len(rig.received[MarkerArray]) > 4, 'deletions')
+    assert all(m.action == Marker.DELETE for m in rig.received[MarkerArray][4].markers)
+
 
 def test_a_late_joiner_still_learns_the_skeleton(rig: Rig) -> None:
     rig.start()

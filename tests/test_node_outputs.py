@@ -29,6 +29,7 @@ from test_node import (  # noqa: F401 (fixtures)
     stamp_of,
     weights,
 )
+from visualization_msgs.msg import MarkerArray
 
 from hand_pose_ros.angles import ANGLES, finger_angles
 from hand_pose_ros.depth import decode_image
@@ -205,6 +206,9 @@ def test_joints_in_the_target_frame(rig: Rig, monkeypatch: pytest.MonkeyPatch) -
                 raise stand_in.TransformException('two unconnected trees')
             return turned()
 
+        def clear(self):
+            asked.append(('cleared',))
+
     stand_in.Buffer = Buffer
     stand_in.TransformListener = lambda buffer, node: SimpleNamespace(unregister=lambda: asked.append(('closed',)))
     monkeypatch.setitem(sys.modules, 'tf2_ros', stand_in)
@@ -217,10 +221,17 @@ def test_joints_in_the_target_frame(rig: Rig, monkeypatch: pytest.MonkeyPatch) -
     assert center == pytest.approx((0.6, 0, 2), abs=0.15)
     rig.until(lambda: poses, 'poses')
     assert poses[0].header.frame_id == 'base_link'
+    markers = rig.received[MarkerArray]
+    rig.until(lambda: markers, 'markers')
+    shown = len(markers)
     publish(image(depth_with_hand(), 8, frame='lost'))
     rig.until_said('lost', 'base_link', 'two unconnected trees')
+    rig.until(lambda: len(markers) > shown, 'markers, which are in the frame of the camera')
     assert stamp_of(rig.answer(publish, image(depth_with_hand(), 9))) == 9
     assert [stamp_of(answer) for answer in rig.received[HandJointsArray]] == [7, 9]
+    assert ('cleared',) not in asked
+    assert stamp_of(rig.answer(publish, image(depth_with_hand(), 3))) == 3  # a bag began again
+    assert ('cleared',) in asked
     assert rig.transition('deactivate') and rig.transition('cleanup') and asked[-1] == ('closed',)
 
 

@@ -113,6 +113,12 @@ def test_names_on_both_sides_decide_what_belongs_together(tmp_path, uvd):
     shuffled = write_uvd(tmp_path / 'p.txt', uvd[[3, 0]], ['3.png', '0.png'])
     result = load_published(shuffled, truth, NYU)
     assert result.summary()['max_mm'] == pytest.approx(0, abs=1e-6) and '2 of the 5 frames' in result.notes[0]
+    # Rows are those of the dataset, in its order, and what has gaps tells nothing of jitter.
+    np.testing.assert_allclose(result.truth, load_published(truth, truth, NYU).truth[[0, 3]])
+    assert result.summary()['jitter_mm'] is None
+    backwards = load_published(write_uvd(tmp_path / 'b.txt', uvd[::-1], names[::-1]), truth, NYU)
+    np.testing.assert_allclose(backwards.predictions, load_published(truth, truth, NYU).predictions)
+    assert backwards.in_time
     with pytest.raises(InputError, match=r"'9\.png' is not in"):
         load_published(write_uvd(tmp_path / 'q.txt', uvd[:1], ['9.png']), truth, NYU)
     with pytest.raises(InputError, match=r"'1\.png' stands on two lines"):

@@ -184,6 +184,7 @@ def test_the_command_publishes_and_counts(bag, ros_domain, capsys):
     assert '12  /depth/image_rect' in capsys.readouterr().out
     assert main(['replay', str(bag.with_name('missing.bag'))]) == 1
     assert 'missing.bag: there is no such bag' in capsys.readouterr().err
-    with pytest.raises(SystemExit) as leaving:
-        main(['replay', str(bag), '--rate', '0'])
-    assert leaving.value.code == 2
+    for option, value in (('--rate', '0'), ('--start', '-1'), ('--start', 'nan')):
+        with pytest.raises(SystemExit) as leaving:
+            main(['replay', str(bag), option, value])
+        assert leaving.value.code == 2

@@ -87,6 +87,12 @@ def test_report_without_truth_shows_times_and_first_middle_last(result, tmp_path
     assert 'latency, 99th percentile' in html and 'Accuracy' not in html
 
 
+def test_notes_of_all_results_are_told(result, tmp_path):
+    one, other = (replace(result, name=name, notes=(f'what to know of {name}',)) for name in ('one', 'other'))
+    html = write_report([one, other], tmp_path).read_text()
+    assert 'one: what to know of one' in html and 'other: what to know of other' in html
+
+
 def test_report_of_nothing_found_can_be_written(result, tmp_path):
     nothing = Result('n', HAND21, CAMERA, np.full((3, 21, 3), np.nan), result.truth[:3])
     assert '<canvas data-view' not in write_report([nothing], tmp_path).read_text()

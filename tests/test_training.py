@@ -298,6 +298,7 @@ def test_any_value_of_a_recipe_can_be_replaced():
 @pytest.mark.parametrize(('override', 'message'), [
     ('lr=1', "no 'lr'"), ('samples=many', 'not of type'), ('samples=1.5', 'not of type'), ('seed', 'key=value'),
     ('samples=-5', '--set samples=-5: must be at least 1'), ('batch_size=0', 'at least 1'), ('seed=-1', 'at least 0'),
+    ('seed=20261126', 'less than 4194304'),
     ('augmentation=strong', 'choose one of'), ('augmentation.strong=1', "no 'strong'"), ('seed.x=1', 'is one value')])
 def test_a_wrong_override_is_one_sentence(override, message):
     with pytest.raises(HandPoseError, match=message):

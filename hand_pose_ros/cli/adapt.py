@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hand_pose_ros.cli.arguments import add_bag, bag_options, count
+from hand_pose_ros.cli.arguments import add_bag, bag_options, count, keep_input
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.files import check_writable
 
@@ -60,6 +60,8 @@ def run(args: argparse.Namespace) -> int:
     """Adapt, compare, write the weights, and say whether they are better."""
     if args.out.suffix != '.safetensors':
         args.parser.error(f'--out {args.out}: the name must end in .safetensors')
+    if args.model:
+        keep_input(args.out, args.model)
     check_writable(args.out)  # now, not after minutes of work
 
     import torch

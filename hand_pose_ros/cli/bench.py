@@ -55,8 +55,11 @@ def run(args: argparse.Namespace) -> int:
 
     from hand_pose_ros import __version__
     from hand_pose_ros.files import write_json
+    from hand_pose_ros.models.checkpoints import load_checkpoint
     from hand_pose_ros.runtime import default_threads
 
+    if args.model:
+        load_checkpoint(args.model)  # now, not after minutes of work
     threads = args.threads or default_threads()
     torch.set_num_threads(threads)
     torch.manual_seed(0)

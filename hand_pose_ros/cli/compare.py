@@ -16,7 +16,7 @@ from hand_pose_ros.cli.evaluate import print_summaries
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.evaluation import metrics
 from hand_pose_ros.evaluation.published import DATASETS, load_result
-from hand_pose_ros.evaluation.results import Result
+from hand_pose_ros.evaluation.results import Result, told_notes
 from hand_pose_ros.files import write_json
 
 EXAMPLES = """examples:
@@ -52,9 +52,9 @@ def run(args: argparse.Namespace) -> int:
         args.error('give at least two results')
     dataset = DATASETS[args.dataset] if args.dataset else None
     results = _named_apart([load_result(source, args.ground_truth, dataset) for source in args.results], args.results)
+    for note in told_notes(results):
+        print(f'NOTE: {note}', file=sys.stderr)
     for result in results:
-        for note in result.notes:
-            print(f'NOTE: {result.name}: {note}', file=sys.stderr)
         if result.truth is None:
             raise InputError(f'{result.name} has no ground truth to be compared on: evaluate it with --ground-truth')
     summaries = [result.summary() for result in results]

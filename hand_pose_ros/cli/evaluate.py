@@ -25,7 +25,7 @@ from hand_pose_ros.cli.arguments import (
 )
 from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.evaluation import published
-from hand_pose_ros.evaluation.results import Result
+from hand_pose_ros.evaluation.results import Result, told_notes
 from hand_pose_ros.evaluation.tables import ACCURACY_COLUMNS, accuracy_rows, number, text_table
 from hand_pose_ros.files import check_writable, write_json
 
@@ -89,7 +89,8 @@ def run(args: argparse.Namespace) -> int:
         args.error(f'--out {args.out}: the result is an .npz file')
     out = Path(args.out) / 'any.npz' if args.out and len(args.bags) > 1 else args.out
     for path in filter(None, (args.json, out, args.report and Path(args.report) / 'report.html')):
-        for source in args.bags:
+        for source in filter(None, (*args.bags, args.ground_truth, args.predictions,
+                                    *(compared.rpartition('=')[2] for compared in args.compare))):
             keep_input(path, source)
         check_writable(path)  # now, not after minutes of work
     if args.predictions:
@@ -241,7 +242,7 @@ def _names(bags: Sequence[str]) -> dict[str, str]:
 def _deliver(args: argparse.Namespace, result: Result, others: Sequence[Result],
              read_depths: Callable[[Sequence[int]], dict[int, Any]] | None) -> None:
     """Print the numbers, and write the files that were asked for."""
-    for note in result.notes:
+    for note in told_notes([result, *others]):
         print(f'NOTE: {note}', file=sys.stderr)
     summary = result.summary()
     print_summaries([(result.name, summary), *((other.name, other.summary()) for other in others)])

@@ -48,22 +48,23 @@ def run(args: argparse.Namespace) -> int:
     """
     if not args.rate > 0:
         args.parser.error(f'--rate {args.rate}: must be more than 0')
-    if args.start < 0:
+    if not args.start >= 0:
         args.parser.error(f'--start {args.start}: must not be negative')
     from hand_pose_ros.ros.replay import replaying  # says what is missing where there is no ROS
 
     with replaying(args.bag, args.ros_args, topics=args.topics, rate=args.rate, reliability=args.qos, clock=args.clock,
                    paused=args.start_paused) as replay:
         print(f'{args.bag}: publishing {", ".join(sorted(replay.published))}', flush=True)
+        code = 0
         try:
             replay.wait_for_subscribers(args.wait)
             replay.play(args.start)
             while args.loop:
                 replay.play(args.start)
         except KeyboardInterrupt:
-            pass  # how a loop ends
+            code = int(not args.loop)  # it is how a loop ends
         finally:
             for topic, count in sorted(replay.published.items()):
                 print(f'{count:7d}  {topic}')
             print(f'the latest message was {1000 * replay.lateness_s:.0f} ms late')
-    return 0
+    return code

@@ -143,7 +143,7 @@ def load_published(predictions: str | Path, truth: str | Path, dataset: Dataset)
     return Result(
         name=Path(predictions).name.removesuffix('.gz').removesuffix('.txt'),
         skeleton=dataset.skeleton, intrinsics=camera,
-        predictions=joints, truth=labels,
+        predictions=joints, truth=labels, in_time=isinstance(rows_t, slice) or bool((np.diff(rows_t) == 1).all()),
         parts=dict(dataset.parts) if whole else {}, notes=notes,
         info={'predictions': str(predictions), 'ground_truth': str(truth), 'dataset': dataset.name,
               'intrinsics': f'fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g}'})
@@ -197,8 +197,9 @@ def _match_names(guess: Labels, label: Labels) -> Match:
     left = len(label.names) - len(guess.names)
     note = (f'{guess.path.name} names {len(guess.names)} of the {len(label.names)} frames of {label.path.name}; '
             f'the other {left} are not scored.')
-    return (np.arange(len(guess.names)), np.array([row[name] for name in guess.names]),
-            (note,) if left else ())
+    rows = np.array([row[name] for name in guess.names])
+    order = rows.argsort()  # that of the dataset, whatever that of the predictions: parts and neighbours depend on it
+    return order, rows[order], (note,) if left else ()
 
 
 def _text(path: Path) -> str:

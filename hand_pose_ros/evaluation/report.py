@@ -21,7 +21,7 @@ from hand_pose_ros import __version__
 from hand_pose_ros.drawing import FINGER_COLORS, caption, close_up
 from hand_pose_ros.evaluation import metrics, plots
 from hand_pose_ros.evaluation.published import DATASETS
-from hand_pose_ros.evaluation.results import Result
+from hand_pose_ros.evaluation.results import Result, told_notes
 from hand_pose_ros.evaluation.tables import ACCURACY_COLUMNS, accuracy_rows, number
 from hand_pose_ros.files import write_bytes
 from hand_pose_ros.geometry import Cube, Intrinsics
@@ -59,14 +59,14 @@ def write_report(results: Sequence[Result], folder: str | Path, read_depths: Rea
     Raises:
         InputError: the folder cannot be written.
     """
-    result, folder = results[0], Path(folder)
+    result, folder, notes = results[0], Path(folder), told_notes(results)
     summary = result.summary()
     figures = _figures([r for r in results if r.truth is not None], result)
     for name, figure in figures.items():
         plots.save(figure, folder / name)
     cards = _cards(result, read_depths)
     sections = [
-        _section('Notes', ''.join(f'<p>{escape(note)}</p>' for note in result.notes), 'notes') if result.notes else '',
+        _section('Notes', ''.join(f'<p>{escape(note)}</p>' for note in notes), 'notes') if notes else '',
         _tiles(summary),
         _section('Accuracy', _accuracy(results)) if result.truth is not None else '',
         *(_section(title, _image(figures[name], title) + extra) for name, title, extra in (

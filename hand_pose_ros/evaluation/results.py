@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -122,3 +122,8 @@ class Result:
             raise InputError(f'{path}: the file cannot be read ({error.strerror or error})') from None
         except DAMAGE:
             raise InputError(f'{path}: not a result of `hand-pose evaluate --out`, or damaged') from None
+
+
+def told_notes(results: Sequence[Result]) -> list[str]:
+    """The notes of all results; of several, each says whose it is."""
+    return [f'{result.name}: {note}' if len(results) > 1 else note for result in results for note in result.notes]

@@ -61,6 +61,10 @@ class TargetFrame:
             raise InputError(f"where the camera ('{header.frame_id}') is in the target_frame '{self._frame}' is not "
                              f'known ({error}): publish the transform, or leave target_frame empty') from error
 
+    def clear(self) -> None:
+        """Forget transforms that move: a bag began again, and those of the times to come would be too old."""
+        self._buffer.clear()
+
     def close(self) -> None:
         """Stop listening."""
         self._listener.unregister()

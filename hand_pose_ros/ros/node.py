@@ -153,7 +153,7 @@ class EstimatorNode(LifecycleNode):
         raw = self._params.transport == 'raw'
         self._image_type, self._decode = (Image, decode_image) if raw else (CompressedImage, decode_compressed)
         self._camera.open()
-        self._last_header = Header()
+        self._last_header, self._reset = Header(), True  # whoever is there now need not be who was there before
         self._heard_at, self._statistics.silence = time.monotonic(), ''
         self._regions: list[Region] = []
         inputs = [(CameraInfo, self._camera.topic, self._on_camera_info),
@@ -263,11 +263,13 @@ class EstimatorNode(LifecycleNode):
             self._statistics.time(decode=time.perf_counter() - start)
             intrinsics = self._camera.intrinsics(depth.shape[1], depth.shape[0], params)
             hands = self._estimate(image.header, depth, intrinsics, params)
-            self._outputs.publish_joints(image.header, hands)
-            self._statistics.time(total=time.perf_counter() - start)
-            self._statistics.age(self.get_clock().now().nanoseconds - stamp_ns(image.header))
-            self._statistics.count(answered=1, hands=len(hands))
-            self._outputs.publish_others(image.header, hands, depth, intrinsics, params)
+            try:
+                self._outputs.publish_joints(image.header, hands)
+                self._statistics.time(total=time.perf_counter() - start)
+                self._statistics.age(self.get_clock().now().nanoseconds - stamp_ns(image.header))
+                self._statistics.count(answered=1, hands=len(hands))
+            finally:  # the target frame may be unknown, but what is in that of the camera is not
+                self._outputs.publish_others(image.header, hands, depth, intrinsics, params)
         except HandPoseError as error:
             self._statistics.count(refused=1)
             self._complain(str(error))
@@ -282,13 +284,16 @@ class EstimatorNode(LifecycleNode):
         regions = self._regions if params.detector == 'region' else None
         assert estimator is not None
         params.apply(estimator)
-        if self._reset or stamp_ns(header) < stamp_ns(self._last_header):  # a bag began again
+        began_again = stamp_ns(header) < stamp_ns(self._last_header)
+        if began_again:
+            self._outputs.begin_again()
+        if began_again or self._reset:
             self._reset = False
             estimator.reset()
         self._last_header = header
         if problem := self._camera.frame_problem(header.frame_id, params):
             self._complain(f'{self._image_topic}: {problem}')
-        hands = estimator(depth, intrinsics, time_s=stamp_ns(header) / 1e9, regions=regions)
+        hands = estimator(depth, intrinsics, time_s=stamp_ns(header) / 1e9 or None, regions=regions)
         self._statistics.time(**estimator.timings)
         problem = topics.NO_REGION if regions == [] else depth_problem(depth, params.min_depth, params.max_depth)
         if not hands and problem:

@@ -81,11 +81,19 @@ class Outputs:
             else:
                 self._complain('the frame_id of the depth image is empty, so the joints have no place in tf: let the '
                                'camera driver set it')
-        if params.publish_markers and self._markers_pub.get_subscription_count():
+        if not params.publish_markers:
+            if shown := self._markers.clear():  # it has just been switched off
+                self._markers_pub.publish(conversions.markers_to_msg(header, shown, 0.0))
+        elif self._markers_pub.get_subscription_count():
             markers = self._markers.update(hands)
             self._markers_pub.publish(conversions.markers_to_msg(header, markers, params.marker_lifetime))
         if hands and self._crop_pub.get_subscription_count():
             self._crop_pub.publish(conversions.patch_to_msg(header, crop(depth, hands[0].cube, intrinsics)))
+
+    def begin_again(self) -> None:
+        """Time went back, as when a bag is played in a loop."""
+        if self._frame is not None:
+            self._frame.clear()
 
     def clear(self, header: Header) -> None:
         """Take the hands off the screens."""

@@ -65,9 +65,10 @@ class Params:
     detector: str = _parameter('network', 'How new hands are found: by a small network; as what is nearest to the '
                                'camera, as in the paper; or by the network within the newest region of hand/region '
                                '(sensor_msgs/RegionOfInterest, in pixels of the depth image; one without width or '
-                               'height says that there is no hand).',
+                               'height says that there is no hand). Hands that are tracked stay.',
                                choices=('network', 'nearest', 'region'), fixed=_CONFIGURED)
-    tracking: bool = _parameter(True, 'Look first where the hands of the last image were.')
+    tracking: bool = _parameter(True, 'Look first where the hands of the last image were. Without it every image is '
+                                'searched, and hands have no history: a new id in each, and no smoothing.')
     smoothing: float = _parameter(0.0, 'Cutoff in Hz of the filter on the joints of a hand at rest; 0 = none.',
                                   low=0.0, high=30.0)
     target_frame: str = _parameter('', 'Frame of hand/joints and hand/poses; empty = that of the depth image. Needs '

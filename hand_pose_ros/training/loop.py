@@ -31,7 +31,7 @@ from hand_pose_ros.models.two_looks import TwoLooks
 from hand_pose_ros.runtime import check_device
 from hand_pose_ros.training.augmentation import PRESETS, augment
 from hand_pose_ros.training.folder import RunFolder, TrainingError
-from hand_pose_ros.training.objectives import PoseObjective, RefinerObjective, objective_for
+from hand_pose_ros.training.objectives import PoseObjective, RefinerObjective, joints_count, objective_for
 from hand_pose_ros.training.optimizers import learning_rate, make_optimizer
 from hand_pose_ros.training.recipes import EPOCH_OF_ENDLESS_DATA, Recipe, recipe_to_dict
 from hand_pose_ros.training.state import load_state, save_state, save_tensors
@@ -208,9 +208,8 @@ class Run:
         samples = {key: value.cpu() for key, value in samples.items() if key != 'patch'}
         count, turns = len(samples['joints']), 8
         numbers = torch.arange(turns * count).split(count)
-        poses = [objective.poses(augment(samples, self.recipe.augmentation, some, self.recipe.seed))
-                 for some in numbers]
-        return torch.cat(poses)[samples['hand_present'].repeat(turns)]
+        batches = [augment(samples, self.recipe.augmentation, some, self.recipe.seed) for some in numbers]
+        return torch.cat([objective.poses(batch)[joints_count(batch)] for batch in batches])
 
     # The loop
 

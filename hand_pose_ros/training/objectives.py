@@ -29,7 +29,7 @@ class PoseObjective(nn.Module):
 
     def forward(self, batch: Batch) -> Terms:
         joints, truth = self.predict(batch['patch']).float(), batch['joints'][:, self.joints]
-        return {'joints': joint_loss(self.recipe.loss, self.recipe.knee, joints, truth, _counts(batch))}
+        return {'joints': joint_loss(self.recipe.loss, self.recipe.knee, joints, truth, joints_count(batch))}
 
     def poses(self, batch: Batch) -> Tensor:
         """What the network has to give for these samples, (B, J, 3): the prior is one of such poses."""
@@ -81,7 +81,7 @@ class DenseObjective(PoseObjective):
     def _terms(self, out: dict[str, Tensor], batch: Batch, truth: Tensor, scale: Tensor) -> Terms:
         """The loss of an answer to a batch whose joints (B, J, 3) are in units of the cube, or of one that
         is smaller by this factor (B,)."""
-        counts, half = _counts(batch), batch['cube_side'] / 2 * scale
+        counts, half = joints_count(batch), batch['cube_side'] / 2 * scale
         joints, refined = out['joints'].float(), out['unrefined'] is not out['joints']
         directions, closeness = encode(out['positions'], truth)
         seen = out['seen']  # (B, 1, 32, 32)
@@ -197,7 +197,7 @@ class RefinerObjective(nn.Module):
         for i in range(self.ITERATIONS):
             estimate = self.refiner(batch['patch'], estimate, iterations=1).float()
             terms[f'joints_{i + 1}'] = joint_loss(
-                self.recipe.loss, self.recipe.knee, estimate, batch['joints'], _counts(batch))
+                self.recipe.loss, self.recipe.knee, estimate, batch['joints'], joints_count(batch))
         return terms
 
     def predict(self, patch: Tensor) -> Tensor:
@@ -219,7 +219,7 @@ def objective_for(network: nn.Module, recipe: Recipe, skeleton: Skeleton) -> Pos
     return OBJECTIVES.get(str(vars(network)['architecture']), PoseObjective)(network, recipe, skeleton)
 
 
-def _counts(batch: Batch) -> Tensor:
+def joints_count(batch: Batch) -> Tensor:
     """The samples whose joints count: with a hand, and shown with the right side."""
     return batch['hand_present'] & ~batch['mirrored']
 

@@ -11,6 +11,9 @@ from typing import Any, TypeVar
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.training.augmentation import PRESETS, Augmentation
 
+MAX_SEED = 1 << 22
+"""Seeds and the numbers of samples share the 63 bits of a key."""
+
 
 @dataclass(frozen=True)
 class Recipe:
@@ -147,6 +150,8 @@ def _replace(target: T, keys: list[str], text: str, item: str) -> T:
         least = 0 if key in ('first_shard', 'last_shard', 'seed') else 1
         if 'int' in fields[key] and value is not None and value < least:
             raise HandPoseError(f'--set {item}: must be at least {least}')
+        if key == 'seed' and value >= MAX_SEED:
+            raise HandPoseError(f'--set {item}: must be less than {MAX_SEED}')
     return dataclasses.replace(target, **{key: value})  # type: ignore[type-var]
 
 

@@ -114,7 +114,7 @@ def _network_rows(name: str, threads: int, rounds: int, compiled: bool) -> dict[
     from hand_pose_ros.runtime import make_engine
     from hand_pose_ros.runtime.engine import Pipeline, TorchEngine
 
-    pipeline = Pipeline(load_checkpoint(name).network)
+    pipeline = Pipeline(load_checkpoint(name).network).eval()  # the export puts modules back into the mode of the whole
     patch = _patches(1)
     array = patch.numpy()
     engine = make_engine(pipeline.network, 'cpu', threads)

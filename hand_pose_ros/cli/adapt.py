@@ -60,8 +60,7 @@ def run(args: argparse.Namespace) -> int:
     """Adapt, compare, write the weights, and say whether they are better."""
     if args.out.suffix != '.safetensors':
         args.parser.error(f'--out {args.out}: the name must end in .safetensors')
-    if args.model:
-        keep_input(args.out, args.model)
+    keep_input(args.out, args.model)
     check_writable(args.out)  # now, not after minutes of work
 
     import torch

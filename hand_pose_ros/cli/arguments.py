@@ -43,9 +43,9 @@ def none_or_more(text: str) -> int:
     return value
 
 
-def keep_input(output: str | Path | None, source: str | Path) -> None:
-    """Raise HandPoseError if an output would replace the input."""
-    if output is not None and Path(output).exists() and Path(source).exists() and Path(output).samefile(source):
+def keep_input(output: str | Path | None, source: str | Path | None) -> None:
+    """Raise HandPoseError if an output would replace the input; None is no file."""
+    if output and source and Path(output).exists() and Path(source).exists() and Path(output).samefile(source):
         raise HandPoseError(f'{output}: this is the input, which would be lost: choose another place')
 
 

@@ -153,8 +153,8 @@ def _open(args: argparse.Namespace, stack: ExitStack) -> tuple[Iterator[DepthInp
     """The images of the input, and how many there are."""
     is_png = args.input.suffix.lower() == '.png'
     paths = [args.input] if is_png else sorted(args.input.glob('*.png'), key=_natural) if args.input.is_dir() else []
-    kinds = {path.suffix for path in args.input.iterdir()} if args.input.is_dir() and not paths else {'.mcap'}
-    if not kinds & {'.mcap', '.db3', '.yaml'}:
+    if args.input.is_dir() and not paths and not any(
+            path.suffix in ('.mcap', '.db3', '.yaml') for path in args.input.iterdir()):
         raise InputError(f'{args.input}: the folder holds neither 16-bit depth .png files nor a bag')
     if paths:
         if args.intrinsics is None:

@@ -51,7 +51,7 @@ def add_parser(subparsers: Any) -> None:
         'evaluate', help='score a prediction file, or the estimator on a bag', epilog=EXAMPLES,
         description='Score predictions in a text file against labels, or run the estimator over bags and score it, or '
                     'only time it if there is no ground truth.', formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.set_defaults(error=parser.error, parser=parser)
+    parser.set_defaults(parser=parser)
     parser.add_argument('bags', nargs='*', metavar='BAG', help='a ROS 1 file, a ROS 2 folder, '
                         'or an .mcap or .db3 file; or '
                         'synthetic-test-v1, the benchmark, which is made on the spot')
@@ -84,13 +84,13 @@ def add_parser(subparsers: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Evaluate, print, and write what was asked for; 1 if a bag failed or was damaged."""
     if bool(args.bags) == bool(args.predictions):
-        args.error('give either bags or --predictions')
+        args.parser.error('give either bags or --predictions')
     if args.out and len(args.bags) < 2 and Path(args.out).suffix != '.npz':
-        args.error(f'--out {args.out}: the result is an .npz file')
+        args.parser.error(f'--out {args.out}: the result is an .npz file')
     out = Path(args.out) / 'any.npz' if args.out and len(args.bags) > 1 else args.out
     for path in filter(None, (args.json, out, args.report and Path(args.report) / 'report.html')):
-        for source in filter(None, (*args.bags, args.ground_truth, args.predictions,
-                                    *(compared.rpartition('=')[2] for compared in args.compare))):
+        for source in (*args.bags, args.ground_truth, args.predictions,
+                       *(compared.rpartition('=')[2] for compared in args.compare)):
             keep_input(path, source)
         check_writable(path)  # now, not after minutes of work
     if args.predictions:
@@ -111,7 +111,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _run_text(args: argparse.Namespace) -> int:
     if not args.ground_truth or not args.dataset:
-        args.error('--predictions needs --ground-truth and --dataset')
+        args.parser.error('--predictions needs --ground-truth and --dataset')
     dataset = published.DATASETS[args.dataset]
     if args.intrinsics:
         fx, fy, cx, cy = args.intrinsics
@@ -121,7 +121,7 @@ def _run_text(args: argparse.Namespace) -> int:
 
     if Path(args.predictions).suffix == '.npz':
         if not args.depth_folder:
-            args.error('2D joints need --depth-folder')
+            args.parser.error('2D joints need --depth-folder')
         result = tompson.load_tompson(args.predictions, args.ground_truth, args.depth_folder, dataset, args.protocol)
     else:
         result = published.load_published(args.predictions, args.ground_truth, dataset)
@@ -151,7 +151,7 @@ def _run_bag(args: argparse.Namespace) -> int:
 def _evaluate_live(args: argparse.Namespace, settings: Settings) -> Result:
     """What the live node answers to a bag; images without an answer count as images without a hand."""
     if args.out_bag:
-        args.error('--out-bag does not work with --via-ros: record /hand/joints instead')
+        args.parser.error('--out-bag does not work with --via-ros: record /hand/joints instead')
     from hand_pose_ros.bags import DepthBag
     from hand_pose_ros.evaluation.ground_truth import read_truth, with_truth
     from hand_pose_ros.models.checkpoints import load_checkpoint
@@ -192,7 +192,7 @@ def _run_bags(args: argparse.Namespace) -> int:
     from hand_pose_ros.evaluation.bag_evaluation import evaluate_bags, read_depths
 
     if args.compare or args.via_ros:
-        args.error('--compare and --via-ros work with one bag, not with several')
+        args.parser.error('--compare and --via-ros work with one bag, not with several')
     settings, names = _settings(args), _names(args.bags)
     sinks = {bag: partial(HandBag, Path(args.out_bag) / f'{names[bag]}.mcap') for bag in args.bags if args.out_bag}
     for bag in sinks:

@@ -453,6 +453,20 @@ def test_a_signal_does_not_wait_for_samples_and_the_run_continues_bit_for_bit(fo
     assert same_state(tmp_path / 'whole', tmp_path / 'stopped')
 
 
+def test_a_run_that_was_stopped_in_its_last_validation_does_it_when_resumed(folder, tmp_path):
+    expected = tiny(folder, 'samples=40', out=tmp_path / 'whole').train()
+    run = tiny(folder, 'samples=40', out=tmp_path / 'stopped')
+
+    def stopped():
+        raise KeyboardInterrupt
+    run._validate = stopped
+    with pytest.raises(TrainingError, match='after 40 samples'):
+        run.train()
+    assert not (tmp_path / 'stopped' / 'best.safetensors').exists()
+    assert tiny(folder, 'samples=40', out=tmp_path / 'stopped').train(resume=True) == expected
+    assert (tmp_path / 'stopped' / 'best.safetensors').exists()
+
+
 def run_state(path: Path) -> dict:
     from safetensors import safe_open
     with safe_open(path, 'pt') as file:

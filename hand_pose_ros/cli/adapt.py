@@ -116,8 +116,8 @@ def run(args: argparse.Namespace) -> int:
     print(text_table(('', 'before', 'after'), rows))
     print(f'\nWritten to {args.out}; use them with --model {args.out}.')
     if errors[1] > WORSE * errors[0]:
-        print(f'WARNING: on synthetic-test-v1 the adapted weights are worse ({errors[0]:.1f} mm before, '
-              f'{errors[1]:.1f} mm after): for other hands and cameras use {name}.')
+        print(f'WARNING: on synthetic-test-v1 the adapted weights are worse ({errors[0]:.2f} mm before, '
+              f'{errors[1]:.2f} mm after): for other hands and cameras use {name}.')
     if not is_better(before, after):
         print(f'The adapted weights are no better on the held-out images: keep {name}.')
     elif before['error_mm'] is None:

@@ -41,8 +41,8 @@ def to_onnx(module: nn.Module, example: Tensor, name: str, axes: dict[str, dict[
         return path.read_bytes()
 
 
-def open_session(model: bytes, num_threads: int) -> onnxruntime.InferenceSession:
-    """A session on `num_threads` threads of the CPU, of which the caller's is one."""
+def open_session(model: bytes, num_threads: int, batch: int | None = None) -> onnxruntime.InferenceSession:
+    """A session on `num_threads` threads of the CPU, of which the caller's is one; for any `batch`, or for this one."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = num_threads
     options.inter_op_num_threads = 1
@@ -51,17 +51,20 @@ def open_session(model: bytes, num_threads: int) -> onnxruntime.InferenceSession
     options.add_session_config_entry('session.intra_op.allow_spinning', '0')
     # Errors come as exceptions; warnings about the graph are of no use to who runs it.
     options.log_severity_level = 3
+    if batch is not None:
+        options.add_free_dimension_override_by_name('batch', batch)
     return onnxruntime.InferenceSession(model, options, providers=['CPUExecutionProvider'])
 
 
 class OnnxEngine(Engine):
-    """A session of ONNX Runtime."""
+    """Two sessions of ONNX Runtime. That for one hand knows all shapes beforehand, and works out none in every call."""
 
     name = 'onnxruntime'
 
     def __init__(self, pipeline: Pipeline, num_threads: int) -> None:
-        self.outputs = pipeline.outputs
-        self.session = open_session(export(pipeline), num_threads)
+        self.outputs, model = pipeline.outputs, export(pipeline)
+        self._one, self._many = open_session(model, num_threads, batch=1), open_session(model, num_threads)
 
     def _run(self, patches: Array) -> list[Array]:
-        return self.session.run(None, {'patches': np.ascontiguousarray(patches)})
+        session = self._one if len(patches) == 1 else self._many
+        return session.run(None, {'patches': np.ascontiguousarray(patches)})

@@ -44,6 +44,8 @@ class RunFolder:
         """
         try:
             return recipe_from_dict(json.loads((self.path / 'config.json').read_text())['recipe'])
+        except FileNotFoundError:
+            raise TrainingError(f'{self.path} holds no run to resume: there is no config.json in it') from None
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise TrainingError(f'{self.path} holds no run to resume ({error})') from error
 

@@ -255,6 +255,8 @@ class Run:
         since, at = self.step, time.monotonic()
         with tqdm(total=self.budget, initial=self.step * recipe.batch_size, unit='samples', unit_scale=True,
                   smoothing=0.05, disable=self.rank > 0 or None, dynamic_ncols=True) as bar:
+            if self.step >= self.steps:  # the run was stopped while it validated for the last time
+                result = self._validate()
             while self.step < self.steps:
                 terms = self._train_step(module)
                 self.step += 1

@@ -76,6 +76,14 @@ def expected(weights, depths):
     return [estimator(depth, CAMERA) for depth in depths]
 
 
+def test_pictures_beside_those_of_other_images_are_told(tmp_path, folder, command, capsys):
+    pictures = '--overlay', tmp_path / 'pictures'
+    assert command(folder / '8.png', *INTRINSICS, *pictures) == 0
+    assert 'holds pictures already' not in capsys.readouterr().err
+    assert command(folder / '9.png', *INTRINSICS, *pictures) == 0
+    assert f'NOTE: {tmp_path / "pictures"} holds pictures already' in capsys.readouterr().err
+
+
 def test_a_folder_of_pngs_into_arrays_and_pictures(tmp_path, folder, command, expected, capsys):
     assert command(folder, *INTRINSICS, '--out', tmp_path / 'joints.npz', '--overlay', tmp_path / 'pictures') == 0
     result = np.load(tmp_path / 'joints.npz')

@@ -200,6 +200,8 @@ class _Overlays:
     def __init__(self, folder: Path, skeleton: Skeleton) -> None:
         self._folder, self._skeleton = folder, skeleton
         folder.mkdir(parents=True, exist_ok=True)
+        if any(folder.glob('*.png')):
+            print(f'NOTE: {folder} holds pictures already; those of other images stay', file=sys.stderr)
 
     def add(self, image: DepthInput, depth: NDArray[np.float32], intrinsics: Intrinsics,
             hands: Sequence[HandEstimate]) -> None:

@@ -84,5 +84,8 @@ def run(args: argparse.Namespace) -> int:
         folder.require_none()  # now, not after the first samples were made
     recipe = folder.recipe() if args.resume else get_recipe(args.recipe, args.overrides)
     with logging_redirect_tqdm(), process_group(args.device):
-        Run(args.out, recipe, machine(args)).train(args.resume)
+        training = Run(args.out, recipe, machine(args))
+        training.train(args.resume)
+    if training.rank == 0:
+        print(f'the best weights in validation: {folder.checkpoint("best")}')
     return 0

@@ -45,6 +45,8 @@ class Dataset(ABC):
     """Number of samples; None = as many as one asks for."""
     fingerprint: str
     """Changes whenever the samples change: caches are kept under it."""
+    chunk: int = 64
+    """Samples to ask for at a time: enough to be efficient, few enough to fit the caches of a CPU."""
     cube_side: float = 0.30
     """Metres; the usual side of the cubes, which whoever runs a network trained on them should use too."""
 

@@ -29,14 +29,11 @@ from hand_pose_ros.datasets.memory import keep_freed_memory
 
 log = logging.getLogger(__name__)
 
-_BATCH = 64  # samples made at a time: enough to be efficient, few enough to fit the caches
-
-
 def make_shard(dataset: Dataset, shard: int, shard_size: int) -> Batch:
     """The samples of one shard; patches as float16, which is 0.04 mm in a cube of 0.3 m."""
     end = (shard + 1) * shard_size if dataset.size is None else min((shard + 1) * shard_size, dataset.size)
     parts = []
-    for indices in torch.arange(shard * shard_size, end).split(_BATCH):
+    for indices in torch.arange(shard * shard_size, end).split(dataset.chunk):
         part = dataset.batch(indices)
         parts.append({**part, 'patch': part['patch'].half()})
     return {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
@@ -44,6 +41,8 @@ def make_shard(dataset: Dataset, shard: int, shard_size: int) -> Batch:
 
 class MemoryShards:
     """Shards made when they are first asked for, and kept on the device that made them: for rendering on a GPU."""
+
+    ahead = 0
 
     def __init__(self, dataset: Dataset, shard_size: int) -> None:
         self.dataset, self.shard_size = dataset, shard_size
@@ -73,14 +72,15 @@ class DiskShards:
         folder: where the shards of all datasets are kept.
         workers: processes that make shards.
         limit_gb: delete the shards that were not used for longest when the folder grows beyond this.
+        device: where the shards are read to.
     """
 
-    AHEAD = 4
-    """How many shards beyond the needed ones are made in advance."""
-
     def __init__(self, open_dataset: Callable[[], Dataset], folder: Path, shard_size: int, workers: int = 1,
-                 limit_gb: float = 40) -> None:
+                 limit_gb: float = 40, device: torch.device | None = None) -> None:
         self.dataset, self.shard_size = open_dataset(), shard_size
+        self.ahead = max(4, 2 * workers)
+        """How many shards beyond the needed ones are made in advance: every worker is to have the next one waiting."""
+        self._device = device or torch.device('cpu')
         self._folder = folder / f'{self.dataset.fingerprint}-{shard_size}'
         self._folder.mkdir(parents=True, exist_ok=True)
         self._start_pool = partial(
@@ -117,10 +117,11 @@ class DiskShards:
             DatasetError: a file of the dataset is missing or damaged.
         """
         while shard not in self._open:
-            if shard in self._making:
+            if fresh := shard in self._making:
                 self._wait(shard)
             try:
-                self._open[shard] = read_shard(self.path(shard))
+                tensors = read_shard(self.path(shard), check=not fresh)
+                self._open[shard] = {key: value.to(self._device) for key, value in tensors.items()}
             except (FileNotFoundError, DatasetError):  # not made yet, deleted to make room, or damaged: make it
                 self.path(shard).unlink(missing_ok=True)
                 self.keep([*self._open, shard])
@@ -148,8 +149,8 @@ class DiskShards:
                 path.unlink()
 
 
-def read_shard(path: Path) -> Batch:
-    """The tensors of a shard, mapped from its file.
+def read_shard(path: Path, check: bool = True) -> Batch:
+    """The tensors of a shard, mapped from its file; `check` that they are those that were written.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -161,7 +162,7 @@ def read_shard(path: Path) -> Batch:
             checksum = (file.metadata() or {}).get('sha256')
     except SafetensorError as error:
         raise DatasetError(f'{path} is damaged ({error}); delete it and it is made again') from error
-    if checksum != _checksum(tensors):
+    if check and checksum != _checksum(tensors):
         raise DatasetError(f'{path} does not match its checksum; delete it and it is made again')
     os.utime(path)
     return tensors

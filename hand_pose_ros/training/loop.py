@@ -49,7 +49,7 @@ class Machine:
     """Folder of rendered and decoded samples, shared by all runs."""
     device: str = 'cpu'
     workers: int = 1
-    """Processes that render or decode; 0 = in this process, on `device`, kept in memory (for a GPU)."""
+    """Processes that render or decode; 0 = in this process, on `device`, kept in its memory."""
     threads: int | None = None
     limit_gb: float = 40.0
     """Of the cache."""
@@ -63,7 +63,7 @@ def open_shards(recipe: Recipe, machine: Machine, split: str, device: torch.devi
                       str(device) if machine.workers == 0 else 'cpu')
     if machine.workers == 0:
         return MemoryShards(opening(), recipe.shard_size)
-    return DiskShards(opening, machine.cache, recipe.shard_size, machine.workers, machine.limit_gb)
+    return DiskShards(opening, machine.cache, recipe.shard_size, machine.workers, machine.limit_gb, device)
 
 
 class Run:
@@ -81,6 +81,7 @@ class Run:
         if recipe.precision not in ('float32', 'bfloat16'):
             raise TrainingError(f"unknown precision '{recipe.precision}': choose float32 or bfloat16")
         keep_freed_memory()
+        torch.backends.cudnn.benchmark = True  # all steps have the same shapes
         if machine.threads:
             torch.set_num_threads(machine.threads)
         self._stop = self._waiting = self._ending = False
@@ -314,11 +315,13 @@ class Run:
     @torch.no_grad()
     def _update_average(self) -> None:
         decay = min(self.recipe.average, (1 + self.step) / (10 + self.step))  # the random start is forgotten soon
-        torch._foreach_lerp_(list(self.averaged.parameters()), list(self.objective.parameters()), 1 - decay)
-        for mine, theirs in zip(self.averaged.buffers(), self.objective.buffers(), strict=True):
-            # The running statistics of the last ten batches are those of the last weights, and noisy: averaged ones
-            # are worth millimetres while the learning rate is high.
-            mine.lerp_(theirs, 1 - decay) if mine.is_floating_point() else mine.copy_(theirs)
+        # Buffers, too: the running statistics of the last ten batches are those of the last weights, and noisy;
+        # averaged ones are worth millimetres while the learning rate is high.
+        mine, theirs = ([*module.parameters(), *module.buffers()] for module in (self.averaged, self.objective))
+        moving = [i for i, tensor in enumerate(mine) if tensor.is_floating_point()]
+        torch._foreach_lerp_([mine[i] for i in moving], [theirs[i] for i in moving], 1 - decay)
+        for i in set(range(len(mine))).difference(moving):
+            mine[i].copy_(theirs[i])
 
     def _fail(self, batch: Batch, terms: dict[str, Tensor]) -> None:
         path = self.folder.path / f'failed_batch_{self.step}_{self.rank}.safetensors'

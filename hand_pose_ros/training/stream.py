@@ -86,11 +86,10 @@ class SampleStream:
         n, window = self.shards.shard_size, self.window(stage)
         if self._stage is None or self._stage[0] != stage:
             self._stage = stage, np.random.default_rng((self.seed, stage)).permutation(size)
-            ahead = range(window.stop, window.stop + DiskShards.AHEAD) if self._window is None else ()
+            ahead = range(window.stop, window.stop + self.shards.ahead) if self._window is None else ()
             self.shards.keep([*window, *ahead])
         shards, rows = np.divmod(self._stage[1][offset:offset + len(numbers)], n)
         for shard in np.unique(shards):
             tensors, here = self.shards.read(window[int(shard)]), shards == shard
-            wanted = torch.from_numpy(rows[here])
-            yield {'number': torch.from_numpy(numbers[here]),
-                   **{key: value[wanted.to(value.device)] for key, value in tensors.items()}}
+            wanted = torch.from_numpy(rows[here]).to(tensors['joints'].device)
+            yield {'number': torch.from_numpy(numbers[here]), **{key: value[wanted] for key, value in tensors.items()}}

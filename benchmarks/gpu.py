@@ -1,0 +1,103 @@
+"""What a CUDA GPU makes of the weights that ship: `python benchmarks/gpu.py`, one minute.
+
+For each network, in turn: the engine from array to array, its CUDA graph with the copies to and from pinned memory,
+the graph alone (copies left out, the mean of many replays in a row), and plain PyTorch on the GPU. Then hands a second
+of large batches, from float32 patches in host memory to joints there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from hand_pose_ros.cli.bench import measure, summary
+from hand_pose_ros.files import write_json
+from hand_pose_ros.geometry import PATCH_SIZE
+from hand_pose_ros.models.checkpoints import load_checkpoint
+from hand_pose_ros.runtime import make_engine
+from hand_pose_ros.runtime.cuda_engine import WARM_UP, CudaEngine
+from hand_pose_ros.runtime.engine import Pipeline, TorchEngine
+
+NAMES = ('deep_prior', 'deep_prior_orref', 'hand_dense')
+BATCHES = (64, 1024, 4096)
+
+
+def patches(count: int) -> np.ndarray:
+    """Half hand, half background, as patches are."""
+    made = np.random.default_rng(0).uniform(-0.5, 0.5, (count, 1, PATCH_SIZE, PATCH_SIZE)).astype(np.float32)
+    made[..., PATCH_SIZE // 2:] = 1
+    return made
+
+
+def graph_alone(engine: CudaEngine, replays: int = 500) -> float:
+    """Milliseconds of a replay whose input and output stay on the GPU."""
+    source = torch.from_numpy(patches(1)).to(engine.device)
+    with torch.inference_mode(), torch.cuda.stream(engine.stream):
+        for _ in range(WARM_UP):
+            engine.pipeline(source)
+        engine.stream.synchronize()
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph, stream=engine.stream):
+            engine.pipeline(source)
+        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        graph.replay()
+        start.record()
+        for _ in range(replays):
+            graph.replay()
+        end.record()
+        end.synchronize()
+    return start.elapsed_time(end) / replays
+
+
+def with_copies(engine: CudaEngine) -> Callable[[], None]:
+    """A replay as the engine does it, between two images: the input lies in pinned memory already."""
+    captured = engine.captured[1]
+
+    def call() -> None:
+        with torch.cuda.stream(engine.stream):
+            captured.graph.replay()
+        engine.stream.synchronize()
+    return call
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--json', type=Path, metavar='FILE', help='write the rows there too')
+    args = parser.parse_args()
+    rows: dict[str, dict[str, float]] = {}
+    one = patches(1)
+    for name in NAMES:
+        checkpoint = load_checkpoint(name)
+        engine = make_engine(checkpoint.network, 'cuda', refiner=checkpoint.refiner)
+        assert isinstance(engine, CudaEngine)
+        plain = TorchEngine(Pipeline(checkpoint.network, checkpoint.refiner), 'cuda')
+        made = measure({'engine': lambda engine=engine: engine.run(one), 'graph with copies': with_copies(engine),
+                        'pytorch': lambda plain=plain: plain.run(one)}, rounds=30)
+        rows |= {f'{name}: {how}': row for how, row in made.items()}
+        rows[f'{name}: graph alone'] = {'p50_ms': graph_alone(engine)}
+        for count in BATCHES:
+            many = patches(count)
+            engine.run(many)
+            times = []
+            for _ in range(10):
+                start = time.perf_counter()
+                engine.run(many)
+                times.append(time.perf_counter() - start)
+            row = summary(times)
+            rows[f'{name}: {count} hands'] = {**row, 'hands_per_s': 1000 * count / row['p50_ms']}
+    machine = {'gpu': torch.cuda.get_device_name(), 'torch': torch.__version__, 'python': platform.python_version()}
+    print(', '.join(f'{key} {value}' for key, value in machine.items()))
+    for name, row in rows.items():
+        print(f'{name:38s}' + '  '.join(f'{key} {value:.3f}' for key, value in row.items() if key != 'cpu_ms'))
+    if args.json:
+        write_json(args.json, {'machine': machine, 'rows': rows})
+
+
+if __name__ == '__main__':
+    main()

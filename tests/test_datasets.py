@@ -275,6 +275,8 @@ def test_shards_are_the_same_wherever_they_are_made_and_mended_when_damaged(tmp_
             assert len(disk.read(number)['patch']) == size
             for key, value in memory.read(number).items():
                 assert torch.equal(value, disk.read(number)[key])
+        elsewhere = DiskShards(opening, tmp_path / 'cache', 2, device=torch.device('meta'))  # as a GPU would be
+        assert {value.device.type for value in elsewhere.read(0).values()} == {'meta'}
         good = disk.path(0).read_bytes()
         for damage in (good[:-100], good[:-1] + bytes([good[-1] ^ 1]), b''):
             disk.keep([])

@@ -3,7 +3,7 @@
     python docs/images/failures.py hand_dense deep_prior
 """
 
-import sys
+import argparse
 from io import BytesIO
 from pathlib import Path
 
@@ -20,8 +20,10 @@ SHARES = (0.25, 0.5, 0.75, 0.9, 0.97, 1.0)
 
 
 def main() -> None:
-    batches = list(frames(FRAMES))
-    for model in sys.argv[1:]:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('models', nargs='+', metavar='NAME', help='of weights that ship')
+    models, batches = parser.parse_args().models, list(frames(FRAMES))
+    for model in models:
         result = evaluate_benchmark(model, 'cpu', FRAMES)
         order = np.argsort(result.errors_mm.mean(axis=1))
         figure = qualitative(result, batches, order[[round(share * (len(order) - 1)) for share in SHARES]])

@@ -1,5 +1,6 @@
 """Draws hand21.png: the 21 joints in the package's own synthetic hand. `python docs/images/hand21.py`"""
 
+import argparse
 from pathlib import Path
 
 import cv2
@@ -16,6 +17,7 @@ WIDTH, HEIGHT, FOCAL, DISTANCE = 1040, 900, 2550.0, 0.7
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     hand = HandModel()
     skin, joints = hand(mean_shape(), rest_pose()[None])
     # A right hand that shows its palm to the camera, fingers up: x right, y down, z forward.

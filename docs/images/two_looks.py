@@ -3,6 +3,7 @@
     python docs/images/two_looks.py
 """
 
+import argparse
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,7 @@ def picture(patch: torch.Tensor, joints: torch.Tensor) -> Picture:
 
 @torch.inference_mode()
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     network = load_checkpoint('hand_dense').network
     batch = next(iter(frames(50)))
     chosen = batch['hand_present'].nonzero()[:HANDS, 0]

@@ -72,10 +72,10 @@ def run(args: argparse.Namespace) -> int:
     """Estimate, write what was asked for, and sum up; 1 if any image could not be used."""
     if args.out and args.out.suffix not in ('.npz', '.mcap'):
         args.parser.error(f'--out {args.out}: the name must end in .npz or .mcap')
-    if not args.out and not args.overlay:
-        args.parser.error('say what to write: --out FILE, --overlay FOLDER, or both')
     if not args.input.exists():
         raise InputError(f'{args.input}: there is no such bag, PNG or folder: check the path')
+    if not args.out and not args.overlay:
+        args.parser.error('say what to write: --out FILE, --overlay FOLDER, or both')
     keep_input(args.out, args.input)
     keep_input(args.overlay, args.input.parent if args.input.suffix.lower() == '.png' else args.input)
     with ExitStack() as stack:

@@ -40,6 +40,9 @@ from hand_pose_ros.training.validation import estimate, first_samples
 
 log = logging.getLogger(__name__)
 
+TOLD_EVERY_S = 60.0
+"""Seconds between two lines about the progress in a log, which shows no bar."""
+
 
 @dataclass(frozen=True)
 class Machine:
@@ -254,6 +257,7 @@ class Run:
         recipe = self.recipe
         result: dict[str, Any] = {}
         since, at = self.step, time.monotonic()
+        told = at
         with tqdm(total=self.budget, initial=self.step * recipe.batch_size, unit='samples', unit_scale=True,
                   smoothing=0.05, disable=self.rank > 0 or None, dynamic_ncols=True) as bar:
             if self.step >= self.steps:  # the run was stopped while it validated for the last time
@@ -268,6 +272,9 @@ class Run:
                     bar.set_postfix({**values, **result})
                     rate = (self.step - since) * recipe.batch_size / (time.monotonic() - at)
                     since, at = self.step, time.monotonic()
+                    if bar.disable and at - told > TOLD_EVERY_S:  # no terminal: a line now and then
+                        told = at
+                        log.info('%s of %s samples, %.0f/s, %s', f'{done:,}', f'{self.budget:,}', rate, values)
                     self.folder.write({'step': self.step, 'samples': done, **values, 'rate': round(rate, 1),
                                        'learning_rate': self.optimizer.param_groups[0]['lr']})
                 if self._ending and not last:

@@ -47,13 +47,13 @@ class Synthetic(Dataset):
             variant, ingredients = '', None
         self.name = '-'.join(filter(None, ('synthetic', split, variant)))
         self.device = torch.device(device)
-        self.chunk = _chunk(self.device)
         try:
             # The test split is the benchmark synthetic-test-v1 and goes on behind its end.
             self._hands = SyntheticHands(split, device=device, sensors=SENSORS if split == 'test' else None,
-                                         ingredients=ingredients, chunk=self.chunk)
+                                         ingredients=ingredients)
         except HandPoseError as error:
             raise DatasetError(f'synthetic: {error}') from error
+        self.chunk = self._hands.chunk
         self.fingerprint = f'{self.name}-{self.device.type}-{_code()}'
 
     def batch(self, indices: Tensor) -> Batch:
@@ -84,11 +84,11 @@ class SyntheticScenes(Dataset):
         from hand_pose_ros.synthetic.generator import SyntheticHands
         self.name = f'scenes-{split}'
         self.device = torch.device(device)
-        self.chunk = _chunk(self.device)
         try:
-            self._hands = SyntheticHands(split, device=device, chunk=self.chunk)
+            self._hands = SyntheticHands(split, device=device)
         except HandPoseError as error:
             raise DatasetError(f'scenes: {error}') from error
+        self.chunk = self._hands.chunk
         self.fingerprint = f'{self.name}-{self.device.type}-{_code()}'
 
     def batch(self, indices: Tensor) -> Batch:
@@ -99,11 +99,6 @@ class SyntheticScenes(Dataset):
         return {'patch': scenes['depth'][:, None], 'joints': torch.where(shown[..., None], middles, 0), 'shown': shown,
                 'cube_center': torch.tensor([[0.0, 0.0, 1.0]], device=self.device).repeat(number, 1),
                 'cube_side': torch.full((number,), 2.0, device=self.device), 'hand_present': shown[:, 0]}
-
-
-def _chunk(device: torch.device) -> int:
-    """A GPU is filled by thousands: it takes longer to tell it what to do than to do it for a few."""
-    return 64 if device.type == 'cpu' else 2048
 
 
 def _code() -> str:

@@ -51,13 +51,6 @@ def digest(batch: dict[str, Tensor]) -> tuple[float, float, float]:
             float(batch['visible'].double().mean()))
 
 
-def frozen_values() -> str:
-    """The three constants above as they are for this code on this machine: for a new version of the benchmark."""
-    batch = next(frames(PREFIX, batch=PREFIX))
-    return (f"PREFIX_SHA256 = '{checksum(batch)}'\nPREFIX_MADE_WITH = '{made_with()}'\n"
-            f'PREFIX_DIGEST = ({", ".join(f"{value:.6f}" for value in digest(batch))})')
-
-
 def made_with() -> str:
     """What the last bit of a frame depends on beside this code."""
     return f'torch {torch.__version__.split("+")[0]}, {torch.backends.cpu.get_cpu_capability()}'

@@ -1,6 +1,6 @@
 # make setup   .venv with ROS 2, training and test tools, and this package in it (edits to the source take effect at once)
 # make test    lint, types, tests
-# make demo    the live node on a recorded bag; look into demo_output/
+# make demo    the live node on a bag of a synthetic hand; look into demo_output/
 #
 # Needs Python >= 3.10, a C++ compiler and make. `make PYTHON=python3.12` picks an interpreter.
 

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """The joints of every depth image of a bag (ROS 1, sqlite3 or MCAP) as CSV, without ROS.
 
-    python examples/bag_without_ros.py recording.mcap > joints.csv
+    python examples/bag_without_ros.py demo/hand.mcap > joints.csv
 """
 
 import csv

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """The joints of the hand in one 16-bit depth PNG, without ROS.
 
-    python examples/depth_png.py depth.png --intrinsics 363.9 363.9 255.4 206.3 --picture joints.png
+    python examples/depth_png.py demo/depth.png --intrinsics 364.5 364.5 256 208 --picture joints.png
 """
 
 import argparse

@@ -51,6 +51,7 @@ class Gripper(Node):
         self.opening = float(np.clip(wanted, self.opening - reach, self.opening + reach))
         self.moved = now
         self.commands.publish(Float64MultiArray(data=[self.opening]))
+        self.get_logger().info(f'opening {self.opening:.3f} m', throttle_duration_sec=1.0)
 
 
 def main() -> None:

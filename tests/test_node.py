@@ -606,6 +606,14 @@ def test_diagnostics_tell_rates_times_and_hints(rig: Rig) -> None:
     rig.until(lambda: newest()['level'] == b'\x03', 'staleness')
 
 
+def test_two_nodes_that_publish_the_same_joints_are_told(rig: Rig) -> None:
+    rig.start()
+    assert not any('somebody else' in text for text in rig.said())
+    other = rig.client.create_publisher(HandJointsArray, 'hand/joints', 1)
+    rig.until_said('somebody else publishes /hand/joints', 'namespace')
+    rig.client.destroy_publisher(other)
+
+
 def test_a_slow_network_gets_the_newest_image_never_a_queue(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     node = rig.start()
     publish = rig.camera(RELIABLE, info=camera_info())

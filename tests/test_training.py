@@ -19,7 +19,7 @@ from torch import nn
 
 from hand_pose_ros.cli import main
 from hand_pose_ros.cli.experiment import NAMES
-from hand_pose_ros.datasets import Batch, Dataset, icvl, joints_in_metres
+from hand_pose_ros.datasets import Batch, Dataset, icvl, joints_in_metres, open_dataset
 from hand_pose_ros.datasets.shards import MemoryShards
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.geometry import Cube, Intrinsics, crop
@@ -703,6 +703,36 @@ def test_experiments_train_what_is_missing_and_write_table_plot_and_json(folder,
     assert main(['experiment', 'bottleneck', *arguments]) == 0  # again: nothing is trained twice
     assert all((tmp_path / 'runs' / run / 'state.safetensors').stat().st_mtime_ns == at for run, at in runs.items())
     assert main(['experiment', 'bottleneck', *arguments, '--set', 'knee=0.2']) == 1  # but never another recipe
+
+
+def test_an_experiment_that_leaves_nothing_for_the_refiner_is_refused_at_once(folder, tmp_path, capsys):
+    sets = [part for item in (*TINY, f'root={folder}', 'samples=24') for part in ('--set', item)]
+    assert main(['experiment', 'joints', '--out', str(tmp_path), '--workers', '0', *sets]) == 1
+    assert 'for example with --set last_shard=' in capsys.readouterr().err
+    assert not (tmp_path / 'runs').exists()
+
+
+def test_a_network_is_scored_on_the_test_frames_of_its_dataset(folder, tmp_path, capsys):
+    weights, json_file = tmp_path / 'own.safetensors', tmp_path / 'result.json'
+    network = build('shallow', joints=16).eval()
+    save_checkpoint(weights, network, {'skeleton': 'icvl16', 'cube_side': 0.25})
+    arguments = ['evaluate', 'icvl', '--root', str(folder), '--device', 'cpu']
+    for split, frames in ((['--split', 'test_1'], 3), ([], 6)):
+        assert main([*arguments, *split, '--model', str(weights), '--json', str(json_file)]) == 0
+        summary = json.loads(json_file.read_text())
+        assert summary['frames'] == frames
+    batch = open_dataset('icvl', 'test', folder).batch(torch.arange(6))
+    cube = batch['cube_center'], batch['cube_side']
+    with torch.no_grad():
+        joints = load_checkpoint(weights).network(batch['patch'])
+    apart = joints_in_metres(joints, *cube) - joints_in_metres(batch['joints'], *cube)
+    assert summary['mean_mm'] == pytest.approx(1000 * float(apart.norm(dim=-1).mean()), abs=0.01)
+
+    assert main([*arguments, '--model', 'hand_dense']) == 1
+    assert 'its joints are those of hand21, but icvl has those of icvl16' in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(['evaluate', 'icvl'])
+    assert 'give its folder with --root' in capsys.readouterr().err
 
 
 def test_command_line(tmp_path, folder, capsys):

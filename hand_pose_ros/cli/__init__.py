@@ -14,7 +14,7 @@ from hand_pose_ros import __version__
 from hand_pose_ros.errors import HandPoseError
 
 VERBS = {
-    'demo': 'play the recorded bag that ships through the live node and show what comes out',
+    'demo': 'play the bag that ships through the live node and show what comes out',
     'estimate': 'joints and pictures from a bag or from 16-bit depth PNGs',
     'estimator': 'the ROS 2 node',
     'view': 'depth images and hands in 3D, live or from a bag',
@@ -58,8 +58,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f'hand-pose {args.verb}: {error}', file=sys.stderr)
         return 1
     except OSError as error:  # a file that cannot be read or written
-        print(f'hand-pose {args.verb}: ' + (f'{error.filename}: {error.strerror}' if error.filename else str(error)),
-              file=sys.stderr)
+        what = f'{error.filename}: {error.strerror}' if error.filename else str(error)
+        if isinstance(error, FileExistsError | NotADirectoryError):
+            what += ', and a folder is needed: give another name'
+        print(f'hand-pose {args.verb}: {what}', file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print(f'hand-pose {args.verb}: interrupted', file=sys.stderr)

@@ -1,4 +1,4 @@
-"""`hand-pose demo`: a recorded bag through the live node, over real DDS, and what came out, to look at."""
+"""`hand-pose demo`: a bag through the live node, over real DDS, and what came out, to look at."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ EXAMPLES = """examples:
   hand-pose demo --bag recording.mcap --model my_weights.safetensors
 
 It leaves sheet.png, animation.webp (any browser shows it) and summary.json in the folder. The exit code is 0 if every
-image was answered.
+image was answered. The bag that ships shows a synthetic hand, as a simulated camera sees it.
 """
 
 
 def add_parser(subparsers: Any) -> None:
     """Add this verb to the command line."""
     parser = subparsers.add_parser(
-        'demo', help='play the recorded bag that ships through the live node and show what comes out',
+        'demo', help='play the bag that ships through the live node and show what comes out',
         description='Play a bag through the real node in another process, and show what comes out.', epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--out', type=Path, default=Path('demo_output'), metavar='FOLDER', help='(demo_output)')
@@ -53,9 +53,11 @@ def run(args: argparse.Namespace) -> int:
     from hand_pose_ros.ros.live import play_through_node
 
     path = args.bag or resource('demo/hand.mcap')
+    args.out.mkdir(parents=True, exist_ok=True)  # now, not after minutes of work
     parameters = {'model': args.model} if args.model else {}
     with DepthBag(path) as bag:
-        print(f'playing {len(bag)} depth images of {path} through the node ...', flush=True)
+        shown = '' if args.bag else ' (a synthetic hand)'
+        print(f'playing {len(bag)} depth images of {path}{shown} through the node ...', flush=True)
         answers = play_through_node(bag, parameters=parameters, patient=True)
         skeleton = get_skeleton(answers.skeleton)
         hands = {stamp: [hand_from_msg(hand, skeleton) for hand in answer.hands]
@@ -64,7 +66,6 @@ def run(args: argparse.Namespace) -> int:
     pictures = [overlay(frame.depth, frame.intrinsics, hands.get(frame.stamp_ns, []), skeleton, ANIMATION_HEIGHT)
                 for frame in frames]
     summary = summarise([frame.stamp_ns for frame in frames], answers, hands, _truth(path, skeleton))
-    args.out.mkdir(parents=True, exist_ok=True)
     chosen = np.linspace(0, len(pictures) - 1, min(SHEET_PICTURES, len(pictures))).round().astype(int)
     sheet = contact_sheet([pictures[i] for i in chosen], 3)
     write_bytes(args.out / 'sheet.png', cv2.imencode('.png', sheet)[1].tobytes())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
@@ -38,6 +39,7 @@ EXAMPLES = """examples:
   hand-pose evaluate recording.mcap --ground-truth /truth/joints --json result.json --out result.npz
   hand-pose evaluate day1/*.bag --depth-topic /camera/depth/image_rect --intrinsics 476 476 314 243 --out results
   hand-pose evaluate synthetic-test-v1 --model hand_dense --json result.json
+  hand-pose evaluate nyu --root /data/NYU --split test_2 --model runs/nyu/best.safetensors --json result.json
   torchrun --nproc-per-node 4 --no-python hand-pose evaluate bags/*.mcap --out results
 
 Text files have a frame a line, `u v d` for each joint: pixels and millimetres; gzipped or not, behind a file name
@@ -54,7 +56,8 @@ def add_parser(subparsers: Any) -> None:
     parser.set_defaults(parser=parser)
     parser.add_argument('bags', nargs='*', metavar='BAG', help='a ROS 1 file, a ROS 2 folder, '
                         'or an .mcap or .db3 file; or '
-                        'synthetic-test-v1, the benchmark, which is made on the spot')
+                        'synthetic-test-v1, the benchmark, which is made on the spot; or nyu, icvl, msra or msra:P1 to '
+                        'msra:P8 with --root')
     parser.add_argument('--ground-truth', metavar='G', help='text file of labels; with a bag also an .npz file with '
                         'joints (frames, joints, 3) in metres, or a topic of the bag with HandJointsArray')
     parser.add_argument('--json', metavar='FILE', help='write all numbers there')
@@ -78,6 +81,9 @@ def add_parser(subparsers: Any) -> None:
                       'beside the original; with several bags a folder')
     bags.add_argument('--via-ros', action='store_true', help='play the bag through the live node at its pace, and '
                       'report the images it dropped and the latency from image to joints')
+    recorded = parser.add_argument_group('recorded datasets')
+    recorded.add_argument('--root', type=Path, metavar='FOLDER', help='of nyu, icvl or msra, as distributed')
+    recorded.add_argument('--split', help='test (the default), and of nyu and icvl test_1 and test_2; or val, train')
     bags.add_argument('--jobs', type=count, metavar='N', help='bags at the same time (default: one per core)')
 
 
@@ -94,17 +100,28 @@ def run(args: argparse.Namespace) -> int:
             keep_input(path, source)
         check_writable(path)  # now, not after minutes of work
     if args.predictions:
-        refuse(args, (*ESTIMATOR, 'depth_topic', 'camera_info_topic', 'depth_scale', 'out_bag', 'via_ros', 'jobs'),
-               'is for bags: these joints are estimated already')
+        refuse(args, (*ESTIMATOR, 'depth_topic', 'camera_info_topic', 'depth_scale', 'out_bag', 'via_ros', 'jobs',
+                      'root', 'split'), 'is for bags and recorded datasets: these joints are estimated already')
         return _run_text(args)
     refuse(args, ('dataset', 'depth_folder', 'protocol'), 'is for --predictions')
-    if args.bags == ['synthetic-test-v1']:
+    recorded = len(args.bags) == 1 and re.fullmatch(r'nyu|icvl|msra(:P\d)?', args.bags[0]) is not None
+    if not recorded:
+        refuse(args, ('root', 'split'), 'is for nyu, icvl and msra')
+    if recorded or args.bags == ['synthetic-test-v1']:
         refuse(args, ('side', 'detector', 'cube_size', 'min_score', 'ground_truth', 'depth_topic', 'camera_info_topic',
                       'intrinsics', 'depth_scale', 'out_bag', 'via_ros', 'jobs'),
-               'is for bags: crops, sides and truth are those of the benchmark')
-        from hand_pose_ros.evaluation.benchmark_evaluation import evaluate_benchmark
+               f'is for bags: crops, sides and truth are those of {args.bags[0]}')
+        if recorded and args.root is None:
+            args.parser.error(f'{args.bags[0]} is read from disk: give its folder with --root')
         others = [published.load_result(source) for source in args.compare]
-        _deliver(args, evaluate_benchmark(args.model, args.device, progress=_progress('batches')), others, None)
+        if recorded:
+            from hand_pose_ros.evaluation.dataset_evaluation import evaluate_dataset
+            result = evaluate_dataset(args.bags[0], args.root, args.model, args.split or 'test', args.device,
+                                      _progress('batches'))
+        else:
+            from hand_pose_ros.evaluation.benchmark_evaluation import evaluate_benchmark
+            result = evaluate_benchmark(args.model, args.device, progress=_progress('batches'))
+        _deliver(args, result, others, None)
         return 0
     return _run_bag(args) if len(args.bags) == 1 else _run_bags(args)
 

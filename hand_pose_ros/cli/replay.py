@@ -66,5 +66,5 @@ def run(args: argparse.Namespace) -> int:
         finally:
             for topic, count in sorted(replay.published.items()):
                 print(f'{count:7d}  {topic}')
-            print(f'the latest message was {1000 * replay.lateness_s:.0f} ms late')
+            print(f'no message was published more than {1000 * replay.lateness_s:.0f} ms after its time')
     return code

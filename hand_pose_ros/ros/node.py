@@ -223,6 +223,9 @@ class EstimatorNode(LifecycleNode):
             if silence != self._statistics.silence:  # who publishes what may change meanwhile, and the remedy with it
                 self._statistics.silence = silence
                 self._complain(silence)
+        if listening and self.count_publishers(self._outputs.joints_topic) > 1:
+            self._complain(f'somebody else publishes {self._outputs.joints_topic}, too: stop one of them, or give each '
+                           'a namespace (--ros-args -r __ns:=/left)')
         status = self._statistics.report(self.get_name(), self._state, published, self._facts())
         if status.level == DiagnosticStatus.WARN:
             self._say(status.message)

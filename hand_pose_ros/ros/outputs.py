@@ -50,6 +50,11 @@ class Outputs:
         self._states_pub = self._create(JointState, 'hand/joint_states') if params.publish_joint_states else None
         self._tf_pub = self._create(tf, '/tf', qos.TF) if tf else None
 
+    @property
+    def joints_topic(self) -> str:
+        """The name of the joints, as others see it."""
+        return str(self._joints_pub.topic_name)
+
     def publish_skeleton(self) -> None:
         """Tell what the joints will mean."""
         about, now = self._metadata, Header(stamp=self._node.get_clock().now().to_msg())

@@ -67,9 +67,6 @@ def make_engine(network: nn.Module, device: str = 'auto', num_threads: int | Non
         engine = OnnxEngine(pipeline, threads)
         why += f'; {threads} threads'
     elif device.startswith('cuda'):
-        if not torch.cuda.is_available():
-            raise HandPoseError(f"device '{device}' was asked for, but PyTorch {torch.__version__} finds no GPU: "
-                                "use 'cpu' or 'auto', or install a PyTorch for CUDA and its driver")
         from hand_pose_ros.runtime.cuda_engine import CudaEngine
         engine = _on(device, lambda: CudaEngine(pipeline, device))
     else:
@@ -84,6 +81,9 @@ def check_device(device: str) -> None:
 
 
 def _on(device: str, work: Callable[[], _T]) -> _T:
+    if device.startswith('cuda') and not torch.cuda.is_available():
+        raise HandPoseError(f"device '{device}' was asked for, but PyTorch {torch.__version__} finds no GPU: "
+                            "use 'cpu', or install a PyTorch for CUDA and its driver")
     try:
         return work()
     except (RuntimeError, AssertionError) as error:  # either, depending on what the device lacks

@@ -81,6 +81,16 @@ class Laboratory:
     def network(self, architecture: str, width: int | None) -> Checkpoint:
         return self.train(label(architecture, width), network=architecture, options={'bottleneck': width})
 
+    def check_refiner(self) -> None:
+        """Raise HandPoseError if nothing would be left to train a refiner on: now, not after the first trainings."""
+        recipe = self.recipe
+        with closing(open_shards(recipe, self.machine, 'train', torch.device('cpu'))) as shards:
+            if shards.dataset.size is not None and recipe.last_shard is None:
+                count = -(-shards.dataset.size // recipe.shard_size)
+                raise HandPoseError(f'a refiner learns from frames that its base has not seen: leave it some of the '
+                                    f'{count} shards of {shards.dataset.name}, for example with --set last_shard='
+                                    f'{max(1, count * 4 // 5)}')
+
     def refined(self, refiner: str) -> Checkpoint:
         """Deep-Prior with this refiner, which is trained on what lies behind the training data of Deep-Prior."""
         self.network('deep', 30)
@@ -186,6 +196,7 @@ def bottleneck(lab: Laboratory) -> str:
 
 def refinement(lab: Laboratory) -> str:
     """No refinement, StdRef and ORRef, and the number of iterations (the paper's right figures)."""
+    lab.check_refiner()
     results = [lab.result('deep-30', lab.network('deep', 30))]
     for refiner in REFINERS:
         results += lab.chain(f'deep-30 + {refiner}', lab.refined(refiner), ITERATIONS)
@@ -196,6 +207,7 @@ def refinement(lab: Laboratory) -> str:
 
 def joints(lab: Laboratory) -> str:
     """Mean error of each joint, direct, with the prior, and refined (two iterations)."""
+    lab.check_refiner()
     results = [lab.result('deep-direct', lab.network('deep', None)), lab.result('deep-30', lab.network('deep', 30)),
                lab.result('deep-30 + or_ref x2', lab.refined('or_ref'))]
     return lab.write_results('joints', results, plots.joint_bars(results))

@@ -235,8 +235,9 @@ class Run:
                 if self.rank == 0 and self._validated < self.step:
                     self._save_checkpoint('last', {})
                 raise TrainingError(f'stopped by a signal after {self.step * self.recipe.batch_size:,} samples, with '
-                                    f"weights in {self.folder.checkpoint('last')}; continue with --resume (an "
-                                    'experiment: with the same command)') from None
+                                    f"weights in {self.folder.checkpoint('last')}; hand-pose train --out "
+                                    f'{self.folder.path} --resume goes on (an experiment goes on by the same command)'
+                                    ) from None
             finally:
                 self.shards.close()
                 self.folder.close()
@@ -247,6 +248,8 @@ class Run:
             self.step, self.best_mm = progress['step'], progress['best_mm'] or float('inf')
             if progress['data'] != self.shards.dataset.fingerprint:
                 log.warning('the training data, or the code that makes them, have changed since step %s', self.step)
+            if self.step >= self.steps and self.rank == 0:
+                log.info('the run in %s is finished already', self.folder.path)
         elif self.rank == 0:
             self.folder.create(self.recipe)
         if self.rank == 0:

@@ -1,0 +1,55 @@
+"""Weights on the test frames of a recorded dataset, on crops as they were trained with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hand_pose_ros.datasets import joints_in_metres, open_dataset
+from hand_pose_ros.datasets.base import RecordedDataset
+from hand_pose_ros.errors import InputError
+from hand_pose_ros.evaluation.bag_evaluation import Progress
+from hand_pose_ros.evaluation.results import Result
+from hand_pose_ros.models.checkpoints import DEFAULT, load_checkpoint
+from hand_pose_ros.runtime import make_engine
+
+BATCH = 64
+
+
+def evaluate_dataset(name: str, root: Path | None, model: str | None = None, split: str = 'test', device: str = 'auto',
+                     progress: Progress = lambda items, total: items) -> Result:
+    """Joints of all frames of a split. The crops follow the protocol of the original code: they start from the label.
+
+    Args:
+        name: of a recorded dataset, see `hand_pose_ros.datasets.open_dataset`.
+        root: its folder.
+        model: name of weights that ship, or path of a checkpoint; None takes the default.
+
+    Raises:
+        InputError: the weights are for other joints.
+        DatasetError: there is no such dataset or split, or its files are missing or damaged.
+    """
+    dataset = open_dataset(name, split, root)
+    assert isinstance(dataset, RecordedDataset) and dataset.size is not None
+    checkpoint = load_checkpoint(model)
+    if checkpoint.metadata['skeleton'] != dataset.skeleton.name:
+        raise InputError(f'{model or DEFAULT}: its joints are those of {checkpoint.metadata["skeleton"]}, but {name} '
+                         f'has those of {dataset.skeleton.name}: choose weights that were trained on it')
+    engine = make_engine(checkpoint.network, device=device, refiner=checkpoint.refiner)
+    predictions, truth = [], []
+    numbers = torch.arange(dataset.size).split(BATCH)
+    for indices in progress(numbers, len(numbers)):
+        batch = dataset.batch(indices)
+
+        def in_metres(joints: Tensor, batch: dict[str, Tensor] = batch) -> np.ndarray:
+            return joints_in_metres(joints, batch['cube_center'], batch['cube_side']).double().numpy()
+
+        predictions.append(in_metres(torch.from_numpy(engine.run(batch['patch'].numpy()))))
+        truth.append(in_metres(batch['joints']))
+    note = 'crops start from the labels, as in the original code; left hands are mirrored'
+    return Result(f'{model or DEFAULT} on {dataset.name}', dataset.skeleton, dataset.frame(0).intrinsics,
+                  np.concatenate(predictions), np.concatenate(truth), notes=(note,),
+                  info={'model': model or DEFAULT, 'engine': engine.name, 'dataset': dataset.name}, in_time=False)

@@ -16,8 +16,6 @@ from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.models.checkpoints import DEFAULT, load_checkpoint
 from hand_pose_ros.runtime import make_engine
 
-BATCH = 64
-
 
 def evaluate_dataset(name: str, root: Path | None, model: str | None = None, split: str = 'test', device: str = 'auto',
                      progress: Progress = lambda items, total: items) -> Result:
@@ -40,7 +38,7 @@ def evaluate_dataset(name: str, root: Path | None, model: str | None = None, spl
                          f'has those of {dataset.skeleton.name}: choose weights that were trained on it')
     engine = make_engine(checkpoint.network, device=device, refiner=checkpoint.refiner)
     predictions, truth = [], []
-    numbers = torch.arange(dataset.size).split(BATCH)
+    numbers = torch.arange(dataset.size).split(dataset.chunk)
     for indices in progress(numbers, len(numbers)):
         batch = dataset.batch(indices)
 

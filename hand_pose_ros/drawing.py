@@ -165,8 +165,8 @@ def _dot(picture: Picture, center: NDArray[np.float64], radius: float, color: tu
     cv2.circle(picture, _fixed(center), round(radius * (1 << _SHIFT)), color, -1, cv2.LINE_AA, _SHIFT)
 
 
-def caption(picture: Picture, text: str) -> None:
-    """Write into the upper left corner of a picture."""
+def caption(picture: Picture, text: str, at: tuple[int, int] = (10, 24), size: float = 0.7) -> None:
+    """Write into the upper left corner of a picture, to be read on anything."""
     around = [((x, y), (0, 0, 0)) for x in (-1, 0, 1) for y in (-1, 0, 1)]  # a thick outline has wider letters
     for (x, y), color in (*around, ((0, 0), (255, 255, 255))):
-        cv2.putText(picture, text, (10 + x, 24 + y), cv2.FONT_HERSHEY_SIMPLEX, 0.7, color, 1, cv2.LINE_AA)
+        cv2.putText(picture, text, (at[0] + x, at[1] + y), cv2.FONT_HERSHEY_SIMPLEX, size, color, 1, cv2.LINE_AA)

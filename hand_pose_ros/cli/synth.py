@@ -135,14 +135,16 @@ def _show(args: argparse.Namespace) -> None:
 
 def _relief(patch: NDArray[np.float32], label: str) -> Picture:
     """A patch lit from the upper left, unsmoothed, so that its noise can be judged; nothing is dark."""
-    import cv2
     import numpy as np
+
+    from hand_pose_ros.drawing import caption
+
     slope_y, slope_x = np.gradient(patch * (len(patch) / 2))
     light = (0.4 * slope_x + 0.5 * slope_y + 0.77) / np.sqrt(slope_x ** 2 + slope_y ** 2 + 1)
     shade = np.clip(light, 0, 1) * 0.75 + 0.125 * (1 - patch)
     grey = np.where(patch < 1, shade * 255, 40).astype(np.uint8).repeat(_ZOOM, 0).repeat(_ZOOM, 1)
     picture: Picture = np.repeat(grey[..., None], 3, axis=2)
-    cv2.putText(picture, label, (4, 12), cv2.FONT_HERSHEY_SIMPLEX, 0.38, (90, 220, 255), 1, cv2.LINE_AA)
+    caption(picture, label, (4, 12), 0.38)
     return picture
 
 

@@ -81,6 +81,11 @@ def check_device(device: str) -> None:
 
 
 def _on(device: str, work: Callable[[], _T]) -> _T:
+    try:
+        torch.device(device)
+    except RuntimeError:  # which lists twenty names
+        raise HandPoseError(f"device '{device}' cannot be used here (PyTorch knows none of this name): "
+                            "use 'cpu' or 'cuda'") from None
     if device.startswith('cuda') and not torch.cuda.is_available():
         raise HandPoseError(f"device '{device}' was asked for, but PyTorch {torch.__version__} finds no GPU: "
                             "use 'cpu', or install a PyTorch for CUDA and its driver")

@@ -254,7 +254,8 @@ class Run:
             self.folder.create(self.recipe)
         if self.rank == 0:
             self.folder.open(self.step)
-            log.info('step %s of %s, %s', self.step, self.steps, self.recipe)
+            log.info('%s on %s, step %s of %s, %s samples each; the recipe is in %s/config.json', self.recipe.network,
+                     self.shards.dataset.name, self.step, self.steps, self.recipe.batch_size, self.folder.path)
 
     def _loop(self, module: nn.Module) -> dict[str, Any]:
         recipe = self.recipe

@@ -376,7 +376,7 @@ def test_a_stopped_run_continues_bit_for_bit(folder, tmp_path, recipe):
             os.kill(os.getpid(), signal.SIGTERM)
         return train_step(module)
     run._train_step = stopping
-    with pytest.raises(TrainingError, match=r'after 28 samples, with .*last.safetensors; continue'):
+    with pytest.raises(TrainingError, match=r'after 28 samples, with .*last.safetensors; .* --resume goes on'):
         run.train()
     facts = load_checkpoint(tmp_path / 'stopped' / 'last.safetensors').metadata  # weights to use
     assert (facts['samples'], facts['validation']) == (28, {})
@@ -415,7 +415,7 @@ def test_a_killed_run_continues_bit_for_bit(folder, tmp_path):
     whole = tiny(folder, *long, out=tmp_path / 'whole')
     for run, resume in ((again, True), (whole, False)):
         stop_after(run, stopped_at + 5)
-        with pytest.raises(TrainingError, match='continue with --resume'):
+        with pytest.raises(TrainingError, match='--resume goes on'):
             run.train(resume)
     assert same_state(tmp_path, tmp_path / 'whole')
 
@@ -450,7 +450,7 @@ def test_a_signal_does_not_wait_for_samples_and_the_run_continues_bit_for_bit(fo
             time.sleep(600)
         return batch(step)
     run.stream.batch = endless
-    with pytest.raises(TrainingError, match=r'after 28 samples, with .*last.safetensors; continue'):
+    with pytest.raises(TrainingError, match=r'after 28 samples, with .*last.safetensors; .* --resume goes on'):
         run.train()
     tiny(folder, 'samples=40', out=tmp_path / 'stopped').train(resume=True)
     assert same_state(tmp_path / 'whole', tmp_path / 'stopped')

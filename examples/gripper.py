@@ -3,8 +3,8 @@
 
     python examples/gripper.py --ros-args -r gripper/commands:=/gripper_controller/commands -p max_opening:=0.08
 
-The command is the opening in metres, as a forward_command_controller takes it. Without a hand that can be trusted the
-gripper stays as it is. It needs ROS 2, as examples/subscribe.py does.
+It listens to the node: start that first, as for examples/subscribe.py. The command is the opening in metres, as a
+forward_command_controller takes it. Without a hand that can be trusted the gripper stays as it is.
 """
 
 import numpy as np

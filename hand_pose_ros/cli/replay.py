@@ -54,7 +54,8 @@ def run(args: argparse.Namespace) -> int:
 
     with replaying(args.bag, args.ros_args, topics=args.topics, rate=args.rate, reliability=args.qos, clock=args.clock,
                    paused=args.start_paused) as replay:
-        print(f'{args.bag}: publishing {", ".join(sorted(replay.published))}', flush=True)
+        print(f'{args.bag}: publishing {", ".join(sorted(replay.published))} from in {args.wait:g} s on: subscribers '
+              'must find it first', flush=True)
         code = 0
         try:
             replay.wait_for_subscribers(args.wait)

@@ -9,16 +9,13 @@ from __future__ import annotations
 
 import argparse
 import platform
-import time
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import torch
 
-from hand_pose_ros.cli.bench import measure, summary
+from hand_pose_ros.cli.bench import measure, patches
 from hand_pose_ros.files import write_json
-from hand_pose_ros.geometry import PATCH_SIZE
 from hand_pose_ros.models.checkpoints import load_checkpoint
 from hand_pose_ros.runtime import make_engine
 from hand_pose_ros.runtime.cuda_engine import WARM_UP, CudaEngine
@@ -28,16 +25,9 @@ NAMES = ('deep_prior', 'deep_prior_orref', 'hand_dense')
 BATCHES = (64, 1024, 4096)
 
 
-def patches(count: int) -> np.ndarray:
-    """Half hand, half background, as patches are."""
-    made = np.random.default_rng(0).uniform(-0.5, 0.5, (count, 1, PATCH_SIZE, PATCH_SIZE)).astype(np.float32)
-    made[..., PATCH_SIZE // 2:] = 1
-    return made
-
-
 def graph_alone(engine: CudaEngine, replays: int = 500) -> float:
     """Milliseconds of a replay whose input and output stay on the GPU."""
-    source = torch.from_numpy(patches(1)).to(engine.device)
+    source = patches(1).to(engine.device)
     with torch.inference_mode(), torch.cuda.stream(engine.stream):
         for _ in range(WARM_UP):
             engine.pipeline(source)
@@ -71,7 +61,7 @@ def main() -> None:
     parser.add_argument('--json', type=Path, metavar='FILE', help='write the rows there too')
     args = parser.parse_args()
     rows: dict[str, dict[str, float]] = {}
-    one = patches(1)
+    one, many = patches(1).numpy(), {f'{count} hands': patches(count).numpy() for count in BATCHES}
     for name in NAMES:
         checkpoint = load_checkpoint(name)
         engine = make_engine(checkpoint.network, 'cuda', refiner=checkpoint.refiner)
@@ -79,18 +69,11 @@ def main() -> None:
         plain = TorchEngine(Pipeline(checkpoint.network, checkpoint.refiner), 'cuda')
         made = measure({'engine': lambda engine=engine: engine.run(one), 'graph with copies': with_copies(engine),
                         'pytorch': lambda plain=plain: plain.run(one)}, rounds=30)
+        made['graph alone'] = {'p50_ms': graph_alone(engine)}
+        batches = measure({how: lambda engine=engine, hands=hands: engine.run(hands) for how, hands in many.items()},
+                          rounds=1)
+        made |= {how: {**row, 'hands_per_s': 1000 * len(many[how]) / row['p50_ms']} for how, row in batches.items()}
         rows |= {f'{name}: {how}': row for how, row in made.items()}
-        rows[f'{name}: graph alone'] = {'p50_ms': graph_alone(engine)}
-        for count in BATCHES:
-            many = patches(count)
-            engine.run(many)
-            times = []
-            for _ in range(10):
-                start = time.perf_counter()
-                engine.run(many)
-                times.append(time.perf_counter() - start)
-            row = summary(times)
-            rows[f'{name}: {count} hands'] = {**row, 'hands_per_s': 1000 * count / row['p50_ms']}
     machine = {'gpu': torch.cuda.get_device_name(), 'torch': torch.__version__, 'python': platform.python_version()}
     print(', '.join(f'{key} {value}' for key, value in machine.items()))
     for name, row in rows.items():

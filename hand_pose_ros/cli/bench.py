@@ -115,7 +115,7 @@ def _network_rows(name: str, threads: int, rounds: int, compiled: bool) -> dict[
     from hand_pose_ros.runtime.engine import Pipeline, TorchEngine
 
     pipeline = Pipeline(load_checkpoint(name).network).eval()  # the export puts modules back into the mode of the whole
-    patch = _patches(1)
+    patch = patches(1)
     array = patch.numpy()
     engine = make_engine(pipeline.network, 'cpu', threads)
     eight = np.repeat(array, 8, axis=0)
@@ -177,7 +177,7 @@ def _refiner_rows(architecture: str, threads: int, rounds: int) -> dict[str, dic
 
     refiner = build(architecture).eval()
     alone = [refiner.for_joint(joint) for joint in range(21)]  # type: ignore[operator]
-    patch = _patches(1)
+    patch = patches(1)
     array, joints = patch.numpy(), Still()(patch)
     plain, engine = TorchEngine(Pipeline(Still(), refiner)), make_engine(Still(), 'cpu', threads, refiner)
 
@@ -244,7 +244,7 @@ def _floor(module: nn.Module, inputs: tuple[Tensor, ...], reads: int = 1) -> dic
             'operations': operations, 'weights': weights}
 
 
-def _patches(count: int) -> Tensor:
+def patches(count: int) -> Tensor:
     """Half hand, half background, as patches are."""
     import torch
 

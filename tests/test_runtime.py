@@ -11,11 +11,14 @@ import torch
 from torch import nn
 
 from hand_pose_ros.cli import main
+from hand_pose_ros.datasets import open_dataset
 from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.models import build
+from hand_pose_ros.models.checkpoints import load_checkpoint
 from hand_pose_ros.models.dense import HandDense
 from hand_pose_ros.runtime import default_threads, make_engine
 from hand_pose_ros.runtime.engine import Pipeline, TorchEngine
+from hand_pose_ros.runtime.fused import fuse
 from hand_pose_ros.runtime.lanes import PairedConvolution, fill_lanes
 
 MM_PER_UNIT = 150
@@ -218,13 +221,40 @@ def test_the_gpu_engine_equals_plain_pytorch(architecture, refiner):
 def test_half_precision_changes_no_joint_by_half_a_millimetre(architecture, refiner):
     """What the GPU engine computes, as far as arithmetic goes, for machines without a GPU."""
     second = trained_refiner(refiner) if refiner else None
-    pipeline = Pipeline(trained(architecture), second)
-    patches = torch.from_numpy(hand_patches(3))
+    expected, answer = in_both_precisions(trained(architecture), second, hand_patches(3))
+    assert_equal_in_half_precision(answer, expected, architecture)
+
+
+def in_both_precisions(network: nn.Module, refiner: nn.Module | None, patches: np.ndarray) -> tuple[np.ndarray, ...]:
+    pipeline = Pipeline(network, refiner).requires_grad_(False).eval()
+    halved = copy.deepcopy(pipeline)
+    fuse(halved.network)
     with torch.inference_mode():
-        expected = pipeline(patches)[0]
-        answer = copy.deepcopy(pipeline).half()(patches)[0]
+        expected, answer = (each(torch.from_numpy(patches))[0] for each in (pipeline, halved.half()))
     assert answer.dtype == torch.float32
-    assert_equal_in_half_precision(answer.numpy(), expected.numpy(), architecture)
+    return expected.numpy(), answer.numpy()
+
+
+@pytest.mark.parametrize('name', ['deep_prior', 'deep_prior_orref', 'hand_dense'])
+def test_weights_that_ship_are_as_good_in_half_precision(name):
+    """On hands: what grows in training may be more than a half can hold, and random weights do not show it."""
+    checkpoint = load_checkpoint(name)
+    batch = open_dataset('synthetic', 'val').batch(torch.arange(64))
+    expected, answer = in_both_precisions(checkpoint.network, checkpoint.refiner, batch['patch'].numpy())
+    hands = batch['hand_present'].numpy()
+    moved_mm = np.linalg.norm(answer - expected, axis=-1)[hands] * MM_PER_UNIT
+    assert moved_mm.mean() < 0.1
+    # A view of the second look that is rounded another way is another view, and may tell another millimetre.
+    assert (moved_mm.max(axis=1) < 0.5).mean() > 0.95
+
+
+def test_fused_layers_give_what_the_layers_give():
+    network = trained('two_looks')
+    fused, patches = copy.deepcopy(network), torch.from_numpy(hand_patches(3))
+    fuse(fused)
+    assert not any(isinstance(module, nn.BatchNorm2d) for module in fused.modules())
+    with torch.inference_mode():
+        torch.testing.assert_close(fused(patches), network(patches), atol=1e-4, rtol=0)
 
 
 @pytest.mark.timeout(300)  # nine seconds of CPU time, whatever else the machine does

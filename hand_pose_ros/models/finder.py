@@ -32,7 +32,7 @@ def channels(depth: Tensor) -> Tensor:
     mean is its value there. What is left is relief.
     """
     seen = ((depth > 0) & (depth < FAR)).to(depth.dtype)
-    nearness = seen * 0.3 / torch.where(seen > 0, depth, 1).clamp(min=0.1)
+    nearness = seen * 0.3 / torch.where(seen > 0, depth, torch.ones_like(depth)).clamp(min=0.1)
     share, total = (F.avg_pool2d(F.avg_pool2d(x, CELL), 5, 1, 2) for x in (seen, nearness))  # over 20 x 20 pixels
     mean = F.interpolate(total / share.clamp(min=1e-3), scale_factor=CELL, mode='bilinear', align_corners=False)
     return torch.cat([nearness, 10 * (nearness - mean) * seen, seen], dim=1)

@@ -135,7 +135,7 @@ class TwoLooks(nn.Module):
     def forward_full(self, patch: Tensor) -> dict[str, Tensor]:
         """(B, 1, 128, 128) in [-1, 1] -> joints, confidence, hand, side and size: see `HandDense.forward_full`."""
         view = self.view(patch)
-        seen = self.second.forward_full(view.patch(patch).to(self.second.maps.weight.dtype))
+        seen = self.second.forward_full(view.patch(patch))
         return {**{name: seen[name] for name in self.outputs},
                 'joints': view.back(seen['joints'].float()), 'size': seen['size'].float() + view.scale.log()}
 

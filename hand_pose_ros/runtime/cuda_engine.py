@@ -10,6 +10,7 @@ from torch import Tensor
 
 from hand_pose_ros.geometry import PATCH_SIZE
 from hand_pose_ros.runtime.engine import Array, Engine, Pipeline
+from hand_pose_ros.runtime.fused import fuse
 
 WARM_UP = 3
 """Runs before the capture: libraries choose algorithms and allocate in the first ones, which a graph must not hold."""
@@ -19,7 +20,7 @@ WARM_UP = 3
 class _Captured:
     graph: torch.cuda.CUDAGraph
     patches: Tensor
-    """Pinned (N, 1, 128, 128), where the graph reads from."""
+    """Pinned (N, 1, 128, 128), where the graph reads from, in the precision that the network takes."""
     answer: tuple[Tensor, ...]
     """Pinned, where the graph writes to."""
 
@@ -35,6 +36,8 @@ class CudaEngine(Engine):
 
     def __init__(self, pipeline: Pipeline, device: str = 'cuda') -> None:
         self.outputs, self.device = pipeline.outputs, torch.device(device)
+        fuse(pipeline.network)  # without their norms some layers give more than a half can hold
+        pipeline.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.pipeline = pipeline.to(self.device).half()
         self.stream = torch.cuda.Stream(self.device)
         self.captured: dict[int, _Captured] = {}
@@ -57,8 +60,10 @@ class CudaEngine(Engine):
         return self.captured[size]
 
     def _capture(self, size: int) -> _Captured:
-        source = torch.ones(size, 1, PATCH_SIZE, PATCH_SIZE, pin_memory=True)
-        with torch.inference_mode(), torch.cuda.device(self.device):
+        source = torch.ones(size, 1, PATCH_SIZE, PATCH_SIZE, dtype=self.pipeline.precision, pin_memory=True)
+        # Nor may what is not halved be rounded as much by the convolutions of a tensor core.
+        exact = torch.backends.cudnn.flags(enabled=True, allow_tf32=False)
+        with torch.inference_mode(), torch.cuda.device(self.device), exact:
             with torch.cuda.stream(self.stream):
                 for _ in range(WARM_UP):
                     answer = self._compute(source)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 
 import numpy as np
 import torch
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.geometry import PATCH_SIZE
-from hand_pose_ros.models.two_looks import TwoLooks
+from hand_pose_ros.models.dense import HandDense
 
 Array = NDArray[np.float32]
 
@@ -26,27 +26,53 @@ class Pipeline(nn.Module):
         self.outputs: tuple[str, ...] = getattr(network, 'outputs', ('joints',))
 
     def half(self) -> Pipeline:
-        """In half precision, but for a first look: that of the second is rounded, and must not depend on it."""
-        first = copy.deepcopy(self.network.first) if isinstance(self.network, TwoLooks) else None
-        super().half()
-        if first is not None:
-            self.network.first = first
+        """In half precision, where that moves no joint by half a millimetre.
+
+        Nothing is with a refiner, to which it matters much where it is told that a joint is; nor is a first look, as
+        the view of the second is rounded and must not depend on it; nor the stem of a dense network, whose weights,
+        rounded, move joints by more than all others together.
+        """
+        if self.refiner is not None:
+            return self
+        dense = [each for each in self.modules() if isinstance(each, HandDense)]
+        exact = [*(each.stem for each in dense), getattr(self.network, 'first', None)]
+        kept = {id(tensor) for module in exact if module is not None for tensor in _tensors(module)}
+        for tensor in _tensors(self):
+            if tensor.is_floating_point() and id(tensor) not in kept:
+                tensor.data = tensor.data.half()
+        for each in dense:
+            each.stem = nn.Sequential(each.stem, _As(each.maps.weight.dtype))
         return self
 
+    @property
+    def precision(self) -> torch.dtype:
+        """Of the patches that it takes."""
+        return next((parameter.dtype for parameter in self.network.parameters()), torch.float32)
+
     def forward(self, patches: Tensor) -> tuple[Tensor, ...]:
-        """Patches (B, 1, 128, 128) float32 -> what `outputs` name, float32."""
+        """Patches (B, 1, 128, 128) -> what `outputs` name, float32."""
         full = getattr(self.network, 'forward_full', None)
-        own = patches.to(_precision(self.network))
+        own = patches.to(self.precision)
         answer: dict[str, Tensor] = {'joints': self.network(own)} if full is None else full(own)
         if self.refiner is not None:
-            answer['joints'] = self.refiner(patches.to(_precision(self.refiner)), answer['joints'])
+            answer['joints'] = self.refiner(own, answer['joints'])
         # Where nothing is to be cast, the exported graph shall not try to.
         return tuple(value if value.dtype == torch.float32 else value.float()
                      for value in (answer[name] for name in self.outputs))
 
 
-def _precision(module: nn.Module) -> torch.dtype:
-    return next((parameter.dtype for parameter in module.parameters()), torch.float32)
+class _As(nn.Module):
+    def __init__(self, dtype: torch.dtype) -> None:
+        super().__init__()
+        self.dtype = dtype
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x.to(self.dtype)
+
+
+def _tensors(module: nn.Module) -> Iterator[Tensor]:
+    yield from module.parameters()
+    yield from module.buffers()
 
 
 class Engine(ABC):

@@ -31,6 +31,8 @@ from hand_pose_ros.models.two_looks import TwoLooks
 from hand_pose_ros.runtime import check_device
 from hand_pose_ros.training.augmentation import PRESETS, augment
 from hand_pose_ros.training.folder import RunFolder, TrainingError
+from hand_pose_ros.training.gradients import Gradients
+from hand_pose_ros.training.losses import Terms
 from hand_pose_ros.training.objectives import PoseObjective, RefinerObjective, joints_count, objective_for
 from hand_pose_ros.training.optimizers import learning_rate, make_optimizer
 from hand_pose_ros.training.recipes import EPOCH_OF_ENDLESS_DATA, Recipe, recipe_to_dict
@@ -115,6 +117,8 @@ class Run:
         self.objective = objective.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.averaged = copy.deepcopy(self.objective) if recipe.average else self.objective
         self.optimizer = make_optimizer(recipe, self.objective)
+        self._next: Batch | None = None
+        self._aside = torch.cuda.Stream(self.device, priority=-1) if self.device.type == 'cuda' else None
         self.step, self.best_mm = 0, float('inf')
         self._validated = 0  # step
         self._saved = time.monotonic()
@@ -259,6 +263,7 @@ class Run:
 
     def _loop(self, module: nn.Module) -> dict[str, Any]:
         recipe = self.recipe
+        gradients = Gradients(module, self._autocast, captured=self.device.type == 'cuda' and self.world == 1)
         result: dict[str, Any] = {}
         since, at = self.step, time.monotonic()
         told = at
@@ -267,8 +272,7 @@ class Run:
             if self.step >= self.steps:  # the run was stopped while it validated for the last time
                 result = self._validate()
             while self.step < self.steps:
-                terms = self._train_step(module)
-                self.step += 1
+                terms = self._train_step(gradients)
                 bar.update(recipe.batch_size)
                 done, last = self.step * recipe.batch_size, self.step == self.steps
                 if (self.step % 50 == 0 or last) and self.rank == 0:
@@ -290,34 +294,49 @@ class Run:
                     self._save()
         return result
 
-    def _train_step(self, module: nn.Module) -> dict[str, Tensor]:
+    def _train_step(self, gradients: Gradients) -> Terms:
         """One step; all it depends on are the weights, the state of the optimiser, the recipe and the step's number."""
         recipe = self.recipe
         for group in self.optimizer.param_groups:
             group['lr'] = learning_rate(recipe, self.step / self.steps)
-        with self._interruptible():
-            batch, numbers = self.stream.batch(self.step)
-        batch = {key: value.to(self.device, non_blocking=True) for key, value in batch.items()}
-        batch = augment(batch, recipe.augmentation, numbers, recipe.seed)
-        batch['numbers'] = numbers.to(self.device) + (recipe.seed << 41)
+        if self._next is None:
+            self._prepare()
+        batch, self._next = self._next, None
+        assert batch is not None
+        if self._aside:
+            torch.cuda.current_stream(self.device).wait_stream(self._aside)
         torch.manual_seed((recipe.seed * 1_000_003 + self.step) * 1009 + self.rank)  # for dropout
-        module.train()
-        with self._autocast():
-            terms = module(batch)
+        terms = gradients(batch)
+        self.optimizer.step()
+        if recipe.average:
+            self._update_average()
+        self.step += 1
+        try:
+            if self._aside and self.step < self.steps:
+                self._prepare()  # while the GPU is at the present one
+        finally:  # also when a signal ends the wait: a spoilt state must not be saved
+            self._check(batch, terms)
+        return terms
+
+    def _prepare(self) -> None:
+        """The batch of the next step, on the device and augmented."""
+        with self._interruptible(), torch.cuda.stream(self._aside) if self._aside else nullcontext():
+            batch, numbers = self.stream.batch(self.step)
+            batch = {key: value.to(self.device, non_blocking=True) for key, value in batch.items()}
+            batch = augment(batch, self.recipe.augmentation, numbers, self.recipe.seed)
+            batch['numbers'] = numbers.to(self.device) + (self.recipe.seed << 41)
+        self._next = batch
+
+    def _check(self, batch: Batch, terms: Terms) -> None:
+        """That the loss of the step just made is finite, and whether the run is to end after it."""
         loss = torch.stack(list(terms.values())).sum()
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
         self._ending = self._stop
         if self.world > 1:  # all of them stop when one has to, after the same step
-            shared = torch.stack([loss.detach(), loss.new_tensor(float(self._stop))])
+            shared = torch.stack([loss, loss.new_tensor(float(self._stop))])
             dist.all_reduce(shared)
             loss, self._ending = shared[0], bool(shared[1])
         if not torch.isfinite(loss):
             self._fail(batch, terms)
-        self.optimizer.step()
-        if recipe.average:
-            self._update_average()
-        return {name: value.detach() for name, value in terms.items()}
 
     def _autocast(self) -> AbstractContextManager[Any]:
         half = self.recipe.precision == 'bfloat16'
@@ -334,11 +353,12 @@ class Run:
         for i in set(range(len(mine))).difference(moving):
             mine[i].copy_(theirs[i])
 
-    def _fail(self, batch: Batch, terms: dict[str, Tensor]) -> None:
-        path = self.folder.path / f'failed_batch_{self.step}_{self.rank}.safetensors'
+    def _fail(self, batch: Batch, terms: Terms) -> None:
+        step = self.step - 1
+        path = self.folder.path / f'failed_batch_{step}_{self.rank}.safetensors'
         values = {name: str(value.item()) for name, value in terms.items()}
-        save_tensors(path, batch, {'step': self.step, 'terms': values})
-        raise TrainingError(f'the loss of step {self.step} is not finite ({values}); the batch is in {path}. If it '
+        save_tensors(path, batch, {'step': step, 'terms': values})
+        raise TrainingError(f'the loss of step {step} is not finite ({values}); the batch is in {path}. If it '
                             f'looks right, train anew with a learning_rate below {self.recipe.learning_rate}')
 
     def _distributed(self) -> nn.Module:

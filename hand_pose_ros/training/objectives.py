@@ -28,7 +28,7 @@ class PoseObjective(nn.Module):
         """Which of the skeleton are predicted."""
 
     def forward(self, batch: Batch) -> Terms:
-        joints, truth = self.predict(batch['patch']).float(), batch['joints'][:, self.joints]
+        joints, truth = self.predict(batch['patch']).float(), chosen(batch['joints'], self.joints)
         return {'joints': joint_loss(self.recipe.loss, self.recipe.knee, joints, truth, joints_count(batch))}
 
     def poses(self, batch: Batch) -> Tensor:
@@ -106,7 +106,7 @@ class DenseObjective(PoseObjective):
     def _size(self, batch: Batch) -> Tensor:
         """The logarithm (B,) of the hands' length over the usual one of their cubes."""
         cube = batch['cube_center'], batch['cube_side']
-        bones = joints_in_metres(batch['joints'], *cube)[:, self.middle_finger].diff(dim=1).norm(dim=-1)
+        bones = chosen(joints_in_metres(batch['joints'], *cube), self.middle_finger).diff(dim=1).norm(dim=-1)
         return torch.log((bones.sum(1) / batch['cube_side']).clamp(min=0.01) / TOLD_SIZE)
 
 
@@ -146,7 +146,7 @@ class FinderObjective(PoseObjective):
         random = Random(batch['numbers'])
         mirrored = random.fork(0).chance(0.5)
         depth = torch.where(mirrored[:, None, None, None], depth.flip(3), depth)
-        truth = truth * torch.stack([torch.where(mirrored, -1.0, 1.0), *truth.new_ones(2, len(truth))], -1)[:, None]
+        truth = truth * torch.stack([1 - 2 * mirrored.float(), *truth.new_ones(2, len(truth))], -1)[:, None]
         share = random.fork(1).uniform(high=self.DROPOUT)[:, None, None, None]
         depth = depth * (random.fork(2).uniform(*depth.shape[1:]) >= share)
 
@@ -217,6 +217,11 @@ OBJECTIVES: dict[str, type[PoseObjective]] = {
 def objective_for(network: nn.Module, recipe: Recipe, skeleton: Skeleton) -> PoseObjective:
     """What a network, made by `models.build`, is trained for."""
     return OBJECTIVES.get(str(vars(network)['architecture']), PoseObjective)(network, recipe, skeleton)
+
+
+def chosen(joints: Tensor, which: list[int]) -> Tensor:
+    """Some of the joints (B, J, 3); a list as an index would be copied to a GPU, which a CUDA graph cannot hold."""
+    return torch.stack([joints[:, joint] for joint in which], dim=1)
 
 
 def joints_count(batch: Batch) -> Tensor:

@@ -183,7 +183,7 @@ def test_the_choice_is_logged_with_its_reason(caplog):
     with caplog.at_level(logging.INFO, 'hand_pose_ros.runtime'):
         engine = make_engine(network, num_threads=1)
     assert engine.name in caplog.text
-    assert 'no GPU was found; 1 threads' in caplog.text or 'a GPU was found' in caplog.text
+    assert 'no GPU was found; 1 of 1 threads' in caplog.text or 'a GPU was found' in caplog.text
 
 
 def test_a_device_that_is_not_there_is_named():
@@ -201,6 +201,15 @@ def test_a_device_that_is_not_there_is_named():
 def test_threads_leave_room_for_the_rest(cores, threads, monkeypatch):
     monkeypatch.setattr('os.sched_getaffinity', lambda pid: set(range(cores)), raising=False)
     assert default_threads() == threads
+
+
+@pytest.mark.parametrize(('seconds', 'threads'), [((1.0, 0.5), 2), ((1.0, 0.95), 1), ((1.0, 2.0), 1)])
+def test_a_hand_gets_several_threads_where_they_are_faster(seconds, threads, monkeypatch):
+    monkeypatch.setattr('hand_pose_ros.runtime.onnx_engine._medians', lambda alone, several: seconds)
+    network, patches = trained('deep_prior'), hand_patches(1)
+    engine = make_engine(network, 'cpu', num_threads=2)
+    assert engine.threads == threads
+    assert np.array_equal(engine.run(patches), make_engine(network, 'cpu', num_threads=1).run(patches))
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason='needs a CUDA GPU')

@@ -30,6 +30,7 @@ from hand_pose_ros.skeleton import HAND21
 from hand_pose_ros.training import experiments
 from hand_pose_ros.training.augmentation import PRESETS, Augmentation, augment
 from hand_pose_ros.training.folder import TrainingError
+from hand_pose_ros.training.gradients import Gradients
 from hand_pose_ros.training.loop import Machine, Run
 from hand_pose_ros.training.losses import joint_loss
 from hand_pose_ros.training.objectives import objective_for
@@ -510,8 +511,28 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_batch(folder, tmp
     run = tiny(folder, 'learning_rate=1e30', out=tmp_path)
     with pytest.raises(TrainingError, match=r'step \d+ is not finite .* learning_rate below 1e\+30'):
         run.train()
+    assert not list(tmp_path.glob('state*')) and not list(tmp_path.glob('last*'))  # spoilt
     (saved,) = tmp_path.glob('failed_batch_*.safetensors')
     assert load_file(saved)['patch'].shape == (4, 1, 128, 128)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason='needs a CUDA GPU')
+@pytest.mark.parametrize('network', [MODERN, ('network=deep', 'options.dropout=0.0')])
+def test_a_cuda_graph_trains_as_its_kernels_do(folder, tmp_path, network, monkeypatch):
+    def weights(run):
+        return torch.cat([parameter.detach().flatten() for parameter in run.objective.parameters()])
+
+    def trained(out, captured):
+        monkeypatch.setattr('hand_pose_ros.training.loop.Gradients',
+                            lambda module, precision, **_: Gradients(module, precision, captured))
+        run = tiny(folder, *network, 'samples=40', 'precision=float32', recipe='modern', out=out, device='cuda')
+        start = weights(run).clone()
+        run.train()
+        return start, weights(run)
+
+    start, graph = trained(tmp_path / 'graph', captured=True)
+    _, kernels = trained(tmp_path / 'kernels', captured=False)
+    assert (graph - kernels).norm() < 0.1 * (kernels - start).norm()
 
 
 def test_a_refiner_learns_from_what_its_base_has_not_seen(folder, tmp_path):

@@ -37,8 +37,8 @@ class Params:
                             fixed=_CONFIGURED)
     device: str = _parameter('auto', 'Where the network runs: auto (CUDA when it is there), cpu, cuda or cuda:N.',
                              fixed=_CONFIGURED)
-    num_threads: int = _parameter(0, 'Threads for the network on the CPU; 0 = by the number of cores.', low=0, high=256,
-                                  fixed=_CONFIGURED)
+    num_threads: int = _parameter(0, 'Threads for the network on the CPU, at most; 0 = by the number of cores.', low=0,
+                                  high=256, fixed=_CONFIGURED)
     transport: str = _parameter('raw', 'How depth arrives: raw takes the image topic itself, the others take '
                                 '<image topic>/<transport> (sensor_msgs/CompressedImage).',
                                 choices=('raw', 'compressedDepth', 'compressed'), fixed=_CONFIGURED)

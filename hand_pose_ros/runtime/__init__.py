@@ -45,7 +45,7 @@ def make_engine(network: nn.Module, device: str = 'auto', num_threads: int | Non
     Args:
         device: 'cpu', 'cuda', 'cuda:N', any other device of PyTorch, or 'auto': a CUDA GPU if there is one, else the
             CPU. ONNX Runtime runs the network on a CPU, CUDA graphs (in half precision) on a GPU, PyTorch elsewhere.
-        num_threads: on the CPU; None takes `default_threads()`.
+        num_threads: on the CPU, at most: see `OnnxEngine`; None takes `default_threads()`.
 
     Raises:
         HandPoseError: the device does not exist here, `num_threads` is below 1, or the network gives no joints.
@@ -65,7 +65,7 @@ def make_engine(network: nn.Module, device: str = 'auto', num_threads: int | Non
         if torch.backends.cpu.get_cpu_capability() == 'AVX512':
             fill_lanes(pipeline)
         engine = OnnxEngine(pipeline, threads)
-        why += f'; {threads} threads'
+        why += f'; {engine.threads} of {threads} threads for one hand'
     elif device.startswith('cuda'):
         from hand_pose_ros.runtime.cuda_engine import CudaEngine
         engine = _on(device, lambda: CudaEngine(pipeline, device))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import time
 import warnings
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,6 +18,8 @@ from hand_pose_ros.geometry import PATCH_SIZE
 from hand_pose_ros.runtime.engine import Array, Engine, Pipeline
 
 OPSET = 17
+WORTH_THREADS = 1.1
+"""Threads must make a network faster by this factor to be used: they wake slowly, and are taken from the rest."""
 
 
 def export(pipeline: Pipeline) -> bytes:
@@ -56,14 +59,37 @@ def open_session(model: bytes, num_threads: int, batch: int | None = None) -> on
     return onnxruntime.InferenceSession(model, options, providers=['CPUExecutionProvider'])
 
 
+def _medians(*sessions: onnxruntime.InferenceSession, calls: int = 15) -> list[float]:
+    """Seconds of a call of each for one hand; they are called in turns."""
+    patch = {'patches': np.ones((1, 1, PATCH_SIZE, PATCH_SIZE), np.float32)}
+    seconds = np.empty((calls, len(sessions)))
+    for row in seconds:
+        for i, session in enumerate(sessions):
+            start = time.perf_counter()
+            session.run(None, patch)
+            row[i] = time.perf_counter() - start
+    return list(np.median(seconds, axis=0))
+
+
 class OnnxEngine(Engine):
-    """Two sessions of ONNX Runtime. That for one hand knows all shapes beforehand, and works out none in every call."""
+    """Two sessions of ONNX Runtime. That for one hand knows all shapes beforehand, and works out none in every call.
+
+    Args:
+        num_threads: at most; a hand gets one where more are hardly faster, which is tried out. The joints are the same.
+    """
 
     name = 'onnxruntime'
 
     def __init__(self, pipeline: Pipeline, num_threads: int) -> None:
         self.outputs, model = pipeline.outputs, export(pipeline)
+        self.threads = num_threads
+        """For one hand."""
         self._one, self._many = open_session(model, num_threads, batch=1), open_session(model, num_threads)
+        if num_threads > 1:
+            alone = open_session(model, 1, batch=1)
+            seconds, seconds_of_several = _medians(alone, self._one)
+            if seconds < WORTH_THREADS * seconds_of_several:
+                self._one, self.threads = alone, 1
 
     def _run(self, patches: Array) -> list[Array]:
         session = self._one if len(patches) == 1 else self._many

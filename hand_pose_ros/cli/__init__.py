@@ -9,6 +9,7 @@ import argparse
 import importlib
 import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
 from hand_pose_ros import __version__
 from hand_pose_ros.errors import HandPoseError
@@ -30,10 +31,17 @@ VERBS = {
 }
 
 
+class _Parser(argparse.ArgumentParser):
+    """Wrong arguments are told in one sentence, as everything else is, and not below all that could be given."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f'{self.prog}: {message} (--help says what can be given)\n')
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb and return the exit code."""
     argv = list(sys.argv[1:] if argv is None else argv)
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog='hand-pose', description='3D hand joints from depth images.',
         epilog='hand-pose VERB --help says more about each verb.')
     parser.add_argument('--version', action='version', version=f'hand-pose {__version__}')
@@ -50,8 +58,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if module is None:
         parser.error('the verb comes first')
     if unknown:
-        hint = getattr(module, 'HINT', 'see --help')
-        subparsers.choices[args.verb].error(f'unrecognized arguments: {" ".join(unknown)} ({hint})')
+        hint = f'; {module.HINT}' if hasattr(module, 'HINT') else ''
+        subparsers.choices[args.verb].error(f'unrecognized arguments: {" ".join(unknown)}{hint}')
     try:
         return module.run(args)
     except HandPoseError as error:

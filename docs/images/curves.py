@@ -3,7 +3,7 @@
     python docs/images/curves.py
 
 curves.json holds, for each look and each of its stages, what `metrics.jsonl` of the run says: samples and val_mm. A
-stage begins with what the one before ended with.
+stage begins with what the network had that it goes on from.
 """
 
 import argparse
@@ -18,13 +18,11 @@ from PIL import Image
 def main() -> None:
     argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     looks = json.loads(Path(__file__).with_suffix('.json').read_text())
-    figure, panels = pyplot.subplots(1, len(looks), figsize=(9, 3), layout='constrained')
+    figure, panels = pyplot.subplots(1, len(looks), figsize=(11, 3), layout='constrained')
     for panel, (look, stages) in zip(panels, looks.items(), strict=True):
-        start = 0.0
         for stage, points in stages.items():
             samples, errors = zip(*points, strict=True)
-            panel.plot([start + count / 1e6 for count in samples], errors, marker='.', label=stage)
-            start += samples[-1] / 1e6
+            panel.plot([count / 1e6 for count in samples], errors, marker='.', label=stage)
         panel.set(title=look, xlabel='million samples', ylabel='mm in validation')
         panel.grid(alpha=0.3)
         panel.legend()

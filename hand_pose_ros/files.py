@@ -16,9 +16,15 @@ from hand_pose_ros.errors import InputError
 def in_one_step(path: str | Path) -> Iterator[Path]:
     """A file beside `path` to write to, which becomes `path` when the block ends; after an error nothing is left.
 
+    A link stays one, and its target is replaced. What is no file but takes one (/dev/stdout, a FIFO) is written to.
+
     Raises:
         InputError: the folder cannot be made or written.
     """
+    if _takes_files(path):
+        yield Path(path)
+        return
+    path = Path(path).resolve()
     part = _begin(path)
     mode = part.stat().st_mode
     try:
@@ -31,12 +37,16 @@ def in_one_step(path: str | Path) -> Iterator[Path]:
 
 def check_writable(path: str | Path) -> None:
     """Raise InputError if there can be no such file: before the work whose result it is to hold."""
-    _begin(path).unlink()
+    if not _takes_files(path):
+        _begin(Path(path).resolve()).unlink()
 
 
-def _begin(path: str | Path) -> Path:
+def _takes_files(path: str | Path) -> bool:
+    return Path(path).exists() and not Path(path).is_file() and not Path(path).is_dir()
+
+
+def _begin(path: Path) -> Path:
     """An empty file beside `path`."""
-    path = Path(path)
     if path.is_dir():
         raise InputError(f'{path}: is a folder: give the name of a file')
     part = path.with_name(f'.{path.name}.{os.getpid()}.part')

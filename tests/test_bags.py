@@ -144,6 +144,11 @@ def test_transports_of_one_image_are_one_topic(tmp_path, depths):
             bag.write_depth(STAMPS[0], 'camera', depths[0], CAMERA, codec=codec)
     with DepthBag(tmp_path / 'both.mcap') as bag:
         assert bag.depth_topic == f'/{BASE}' and len(bag) == 1
+    with BagWriter(tmp_path / 'compressed.mcap') as bag:
+        for image in (f'{BASE}/compressed', BASE):  # becomes .../compressed/compressedDepth, which no transport has
+            bag.write_depth(STAMPS[0], 'camera', depths[0], CAMERA, codec='png', topic=f'/{image}')
+    with pytest.raises(InputError, match='several topics carry depth'), DepthBag(tmp_path / 'compressed.mcap'):
+        pass
 
 
 def test_a_camera_info_of_another_size_is_refused_for_its_frame(tmp_path, depths):
@@ -155,15 +160,15 @@ def test_a_camera_info_of_another_size_is_refused_for_its_frame(tmp_path, depths
         _ = frame.intrinsics
 
 
-@pytest.mark.parametrize('empty', [0, 5])
+@pytest.mark.parametrize('empty', [{0}, {5}, {0, 1, 2}, set(range(12))])
 def test_a_camera_info_that_is_empty_is_passed_over(tmp_path, depths, empty):
     with BagWriter(tmp_path / 'bag.mcap') as bag:
         for i, (stamp, depth) in enumerate(zip(STAMPS, depths, strict=True)):
-            camera = CAMERA if i != empty else SimpleNamespace(fx=0.0, fy=0.0, cx=0.0, cy=0.0, width=64, height=48)
+            camera = CAMERA if i not in empty else SimpleNamespace(fx=0.0, fy=0.0, cx=0.0, cy=0.0, width=64, height=48)
             bag.write_depth(stamp, 'camera_optical', depth, camera, codec=None)
-    if empty:
+    if len(empty) < len(STAMPS):
         assert_same(tmp_path / 'bag.mcap', depths)
-    else:  # as long as there has been no other, the camera is unknown
+    else:
         with DepthBag(tmp_path / 'bag.mcap') as bag, pytest.raises(InputError, match=r'not calibrated.*--intrinsics'):
             list(bag)
 
@@ -285,6 +290,14 @@ def test_message_types_are_those_ros_would_hash(tmp_path):
     for name in ('HandJoints', 'HandJointsArray', 'HandSkeleton'):
         fields = [field for field, _ in typestore().fielddefs[f'hand_pose_ros/msg/{name}'][1]]
         assert fields == list(getattr(messages, name).get_fields_and_field_types())
+
+
+def test_a_folder_where_a_bag_of_one_file_is_to_be_is_refused_at_once(tmp_path):
+    (tmp_path / 'bag.mcap').mkdir()
+    with pytest.raises(InputError, match='there is something already'), BagWriter(tmp_path / 'bag.mcap'):
+        pytest.fail('after minutes of work it would be too late')
+    with pytest.raises(InputError, match=r'give a \.bag, \.mcap or \.db3 file'):
+        Bag(tmp_path / 'bag.mcap')
 
 
 def test_a_bag_appears_only_when_it_is_complete(tmp_path, depths):

@@ -192,6 +192,36 @@ def test_a_damaged_bag_is_evaluated_up_to_the_damage(tmp_path, bag, model, capsy
     assert 'cut short' in capsys.readouterr().err and 'before the damage' in got['notes'][0]
 
 
+def test_a_damaged_bag_is_scored_by_its_own_labels_up_to_the_damage(tmp_path, model, result):
+    whole = record(tmp_path / 'bag.mcap', truth=result.predictions).read_bytes()
+    (tmp_path / 'cut.mcap').write_bytes(whole[:int(len(whole) * 0.6)])
+    assert main(arguments(tmp_path / 'cut.mcap', model, '--ground-truth', '/truth/joints',
+                          '--json', tmp_path / 'r.json')) == 1
+    got = json.loads((tmp_path / 'r.json').read_text())
+    assert got['damaged'] and 0 < got['frames'] < FRAMES and got['mean_mm'] < 0.1
+
+
+def test_a_label_is_for_one_image(tmp_path, model, settings, capsys):
+    """Of images 8 ms apart every other one is labelled: the rest must not be scored by the label of a neighbour."""
+    bag = record(tmp_path / 'fast.mcap', step_ns=8_000_000)
+    result = evaluate_bag(bag, settings)
+    np.savez(tmp_path / 'half.npz', joints=result.predictions[::2], stamps_ns=result.stamps_ns[::2])
+    scored = evaluate_bag(bag, replace(settings, ground_truth=str(tmp_path / 'half.npz')))
+    assert scored.summary()['frames'] == FRAMES // 2 and scored.summary()['max_mm'] == 0
+    assert f'{FRAMES // 2} of {FRAMES} images have no label' in scored.notes[0]
+    np.savez(tmp_path / 'zero.npz', joints=result.predictions, stamps_ns=np.zeros(FRAMES, np.int64))
+    assert main(arguments(bag, model, '--ground-truth', tmp_path / 'zero.npz')) == 1
+    assert 'several labels have the stamp 0 ns' in capsys.readouterr().err
+
+
+def test_labels_at_the_camera_are_none(tmp_path, bag, settings, result):
+    truth = result.predictions.copy()
+    truth[3], truth[5, 7] = 0, 0
+    np.savez(tmp_path / 'truth.npz', joints=truth)
+    scored = evaluate_bag(bag, replace(settings, ground_truth=str(tmp_path / 'truth.npz')))
+    assert scored.summary()['frames'] == FRAMES - 1 and scored.summary()['max_mm'] == 0
+
+
 def test_what_is_wrong_with_a_bag_is_said(tmp_path, model, capsys):
     two = tmp_path / 'two.mcap'
     with BagWriter(two) as bag:

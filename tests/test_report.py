@@ -93,6 +93,21 @@ def test_notes_of_all_results_are_told(result, tmp_path):
     assert 'one: what to know of one' in html and 'other: what to know of other' in html
 
 
+def test_report_shows_a_frame_in_which_a_joint_is_unknown(result, tmp_path):
+    truth, predictions = result.truth.copy(), result.predictions.copy()
+    truth[:, 4], predictions[:, 8] = np.nan, np.nan
+    write_report([replace(result, truth=truth, predictions=predictions)], tmp_path / 'out',
+                 depth_images(replace(result, truth=np.nan_to_num(result.truth, nan=1.0))))
+
+
+def test_bones_of_two_subjects_are_not_one_hand_that_changes(result):
+    large = result.truth.copy()
+    large[20:] = large[20:] * 1.2
+    two = replace(result, predictions=large, truth=large)
+    parts = replace(two, parts={'first': (0, 20), 'second': (20, 40)}).summary()
+    assert two.summary()['bone_drift_mm'] > 1 > 0.01 > parts['bone_drift_mm']
+
+
 def test_report_of_nothing_found_can_be_written(result, tmp_path):
     nothing = Result('n', HAND21, CAMERA, np.full((3, 21, 3), np.nan), result.truth[:3])
     assert '<canvas data-view' not in write_report([nothing], tmp_path).read_text()
@@ -172,6 +187,10 @@ def test_compare_refuses_what_cannot_be_compared(result, tmp_path, capsys):
     a, short, blind = (str(tmp_path / f'{name}.npz') for name in ('a', 'short', 'blind'))
     assert main(['compare', a, short]) == 0
     assert 'have 40 and 9 frames: no interval' in capsys.readouterr().err
+    replace(result, predictions=np.full_like(result.predictions, np.nan)).save(tmp_path / 'lost.npz')
+    assert main(['compare', a, str(tmp_path / 'lost.npz'), '--json', str(tmp_path / 'c.json')]) == 0
+    assert 'have less than two frames with a hand in common' in capsys.readouterr().err
+    assert len(json.loads((tmp_path / 'c.json').read_text())['results']) == 2
     assert main(['compare', a, blind]) == 1
     assert 'blind has no ground truth' in capsys.readouterr().err
     assert main(['compare', a, str(tmp_path / 'predictions.txt')]) == 1

@@ -133,7 +133,7 @@ def _remedy(path: Path) -> str:
         return 'it is empty: record or copy it again'
     if path.suffix == '.bag':
         return f'if it was cut short, repair a copy with: rosbag reindex {path}'
-    if path.suffix == '.mcap':
+    if path.suffix == '.mcap' and path.is_file():
         with open(path, 'rb') as file:
             if file.read(5) != b'\x89MCAP':
                 return f'it is no MCAP file: {wanted}'

@@ -104,7 +104,8 @@ class DepthBag(Bag):
         count = 0
         try:
             for connection in self._infos:  # an image that was recorded before its camera_info takes the first one
-                self._remember(connection, self.first(connection), cameras)
+                infos = (self.deserialize(connection, data) for _, _, data in self.messages([connection]))
+                any(self._remember(connection, info, cameras) for info in infos)
             for connection, _, data in self.messages([*self._images, *self._infos]):
                 message = self.deserialize(connection, data)
                 if connection.msgtype == CAMERA_INFO:
@@ -119,19 +120,24 @@ class DepthBag(Bag):
         except InputError as error:
             raise InputError(f'{error} ({count} of {len(self)} depth images were read)') from error
 
-    def _remember(self, connection: Connection, info: Any, cameras: dict[str, Intrinsics]) -> None:
-        """Keep the intrinsics as the newest of their frame_id, and as the newest of all under ''."""
+    def _remember(self, connection: Connection, info: Any, cameras: dict[str, Intrinsics]) -> bool:
+        """Keep the intrinsics as the newest of their frame_id, and as the newest of all under ''; False if unusable."""
         if self.is_ros1:  # K, D, R and P became lower-case in ROS 2
             info = SimpleNamespace(**{name.lower(): value for name, value in vars(info).items()})
         try:
             cameras[info.header.frame_id] = cameras[''] = Intrinsics.from_camera_info(info)
         except InputError as error:  # some drivers begin with one that is empty
             self._unusable = f'{self.path}: {connection.topic}: {error}; or give --intrinsics FX FY CX CY'
+            return False
+        return True
 
     def _find_depth_topic(self) -> str:
         depth = {connection.topic for connection in self.connections if self._carries_depth(connection)}
-        # The transports of one image are one candidate, and the raw one needs the least work.
-        topics = sorted(topic for topic in depth if _image_topic(topic) == topic or _image_topic(topic) not in depth)
+        # The transports of one image are one candidate, and the raw one needs the least work; compressed ones may have
+        # lost something.
+        images = {_image_topic(topic) for topic in depth}
+        ways = {image: (image, *(f'{image}/{transport}' for transport in _TRANSPORTS)) for image in images}
+        topics = sorted(next(topic for topic in ways[image] if topic in depth) for image in images)
         if len(topics) == 1:
             return topics[0]
         if topics:
@@ -182,11 +188,12 @@ class RecordedHands:
     ids: tuple[str, ...]
 
 
-def read_hands(path: str | os.PathLike[str], topic: str | None = None) -> list[RecordedHands]:
+def read_hands(path: str | os.PathLike[str], topic: str | None = None, *, partly: bool = False) -> list[RecordedHands]:
     """All HandJointsArray messages of a bag, in the order of recording.
 
     Args:
         topic: by default the only one of this type.
+        partly: of a damaged bag those before the damage.
 
     Raises:
         InputError: no such topic, several to choose from, or a damaged bag.
@@ -199,7 +206,14 @@ def read_hands(path: str | os.PathLike[str], topic: str | None = None) -> list[R
             there = ', '.join(sorted({c.topic for c in hands}))
             raise InputError(f'{path}: needed is one topic of {_ros_name(HANDS)}{f" named {topic}" if topic else ""}, '
                              f'but the bag has {there or "none"}: give the name of the topic')
-        return [_recorded_hands(bag.deserialize(c, data), f'{path}: {topics[0]}') for c, _, data in bag.messages(found)]
+        recorded: list[RecordedHands] = []
+        try:
+            for connection, _, data in bag.messages(found):
+                recorded.append(_recorded_hands(bag.deserialize(connection, data), f'{path}: {topics[0]}'))
+        except InputError:
+            if not (partly and recorded):
+                raise
+        return recorded
 
 
 def check_frame(source: str, hands: str, images: str) -> None:

@@ -44,7 +44,7 @@ class BagWriter:
         self._is_file = self.path.suffix in ('.mcap', '.db3')
         if self._is_file:
             storage = 'mcap' if self.path.suffix == '.mcap' else 'sqlite3'
-        elif self.path.exists():
+        if self.path.is_dir() or (self.path.exists() and not self._is_file):
             raise InputError(f'{self.path}: there is something already: give another name for the bag, or remove it')
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)

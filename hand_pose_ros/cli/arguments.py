@@ -44,8 +44,12 @@ def none_or_more(text: str) -> int:
 
 
 def keep_input(output: str | Path | None, source: str | Path | None) -> None:
-    """Raise HandPoseError if an output would replace the input; None is no file."""
-    if output and source and Path(output).exists() and Path(source).exists() and Path(output).samefile(source):
+    """Raise HandPoseError if an output would replace the input, or a file of a bag that is a folder; None is no file.
+    """
+    if not (output and source and Path(output).exists() and Path(source).exists()):
+        return
+    inside = Path(source).resolve() == Path(output).resolve().parent
+    if Path(output).samefile(source) or (inside and Path(output).suffix in ('.mcap', '.db3', '.yaml')):
         raise HandPoseError(f'{output}: this is the input, which would be lost: choose another place')
 
 

@@ -72,6 +72,7 @@ def with_truth(result: Result, truth: Truth, frame_id: str) -> Result:
     elif len(joints) != len(result.predictions):
         raise InputError(f'{truth.source}: {len(joints)} labels for {len(result.predictions)} images: give one for '
                          'each image, or an .npz file with stamps_ns')
+    joints = np.where(joints[..., 2:] > 0, joints, np.nan)  # at the camera or behind it: as not labelled in text files
     missing = int(np.isnan(joints).all((1, 2)).sum())
     notes = (f'{missing} of {len(joints)} images have no label in {truth.source} and are not scored.',) \
         if missing else ()
@@ -97,7 +98,8 @@ def _read(source: str, bag: str | Path, skeleton: Skeleton) -> Truth:
 
 
 def _read_topic(topic: str, bag: str | Path, skeleton: Skeleton) -> Truth:
-    messages = [message for message in read_hands(bag, topic) if len(message.joints)]
+    # Of a damaged bag what was before the damage, as of its images, which say so.
+    messages = [message for message in read_hands(bag, topic, partly=True) if len(message.joints)]
     if not messages:
         raise InputError(f'{bag}: {topic} has no hand in any message, so there is nothing to compare with')
     for message in messages:
@@ -113,18 +115,26 @@ def _read_topic(topic: str, bag: str | Path, skeleton: Skeleton) -> Truth:
 
 
 def _match(stamps: NDArray[np.int64], joints: Joints, result: Result, source: str) -> Joints:
-    """For each image the label with the nearest stamp; NaN (J, 3) if none is near enough."""
+    """For each image the label with the nearest stamp; NaN (J, 3) if none is near enough, or another image is nearer.
+    """
     assert result.stamps_ns is not None
     order = np.argsort(stamps, kind='stable')
     stamps, joints = stamps[order], joints[order]
+    if (same := np.diff(stamps) == 0).any():
+        raise InputError(f'{source}: several labels have the stamp {stamps[1:][same][0]} ns, so whose they are is '
+                         'unknown: give an .npz file with a label for each image, and no stamps')
     right = np.searchsorted(stamps, result.stamps_ns).clip(1, max(1, len(stamps) - 1))
     candidates = np.stack([right - 1, right.clip(max=len(stamps) - 1)])
     distances = np.abs(stamps[candidates] - result.stamps_ns)
     nearest = np.take_along_axis(candidates, distances.argmin(0)[None], 0)[0]
     near = distances.min(0) <= TOLERANCE_NS
+    by_label = np.lexsort((distances.min(0), nearest))
+    nearest_image = np.zeros_like(near)
+    nearest_image[by_label[np.unique(nearest[by_label], return_index=True)[1]]] = True
     if not near.any():
         raise InputError(f'{source}: no label is within {TOLERANCE_NS / 1e6:.0f} ms of an image: the nearest is '
                          f'{distances.min() / 1e9:.3f} s away; are the stamps of the same clock?')
     truth = np.full((len(near), *joints.shape[1:]), np.nan)
+    near &= nearest_image
     truth[near] = joints[nearest[near]]
     return truth

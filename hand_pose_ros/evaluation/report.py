@@ -119,8 +119,8 @@ def _cards(result: Result, read_depths: ReadDepths | None) -> list[_Card]:
                 if np.isfinite(joints).all():
                     panels.append(close_up(depth, result.intrinsics, cube, joints, result.skeleton))
                     caption(panels[-1], name)
-            kind = '' if len(panels) == 2 else 'single'
-            picture = _data_image('png', cv2.imencode('.png', np.hstack(panels))[1].tobytes(),
+            kind = ('blind', 'single', '')[len(panels)]
+            picture = '' if not panels else _data_image('png', cv2.imencode('.png', np.hstack(panels))[1].tobytes(),
                                   'joints on the depth image: estimate' + (', truth' if len(panels) > 1 else ''))
         cards.append(_Card(
             f'<div class="frame {kind}"><h3>{escape(title)}</h3>{picture}'

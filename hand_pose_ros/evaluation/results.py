@@ -72,6 +72,8 @@ class Result:
             summary |= self._accuracy(self.predictions, self.truth)
         summary |= {'frames_total': len(self.predictions),
                     'detection_rate': float(np.mean(detected)) if self.predictions.size else None}
+        if self.parts and self.in_time:  # hands of several subjects are not one hand that changes
+            summary['bone_drift_mm'] = metrics.finite_or_none(self._bone_drift_mm())
         if self.parts and self.truth is not None:
             summary['parts'] = {
                 name: self._accuracy(self.predictions[start:stop], self.truth[start:stop])
@@ -80,6 +82,14 @@ class Result:
             summary['latency_ms'] = {
                 stage: metrics.percentiles(1000 * seconds) for stage, seconds in self.seconds.items()}
         return summary | {'notes': list(self.notes), **self.info}
+
+    def _bone_drift_mm(self) -> float:
+        """The mean over the bones, each within the parts."""
+        rows = [slice(start, stop) for start, stop in self.parts.values()]
+        drifts = np.array([metrics.bone_drift_mm(self.predictions[part], self.skeleton) for part in rows])
+        frames = np.array([[part.stop - part.start] for part in rows]) * np.isfinite(drifts)
+        with np.errstate(invalid='ignore'):
+            return metrics.mean_mm(np.sqrt(np.nansum(frames * drifts ** 2, axis=0) / frames.sum(axis=0)))
 
     def _accuracy(self, predictions: NDArray[np.float64], truth: NDArray[np.float64]) -> dict[str, Any]:
         summary = metrics.summarise(predictions, truth, self.skeleton)

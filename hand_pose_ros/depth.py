@@ -121,14 +121,18 @@ def read_png(path: str | Path, depth_scale: float = 0.001) -> NDArray[np.float32
         return to_metres(_decode_png(memoryview(data)), depth_scale)
 
 
-def depth_problem(depth: NDArray[np.float32], near: float, far: float) -> str:
-    """What may be wrong with a depth image (H, W) [m] in which there was no hand; empty when it looks sane."""
+def depth_problem(depth: NDArray[np.float32], near: float, far: float, scale_is_right: bool = False) -> str:
+    """What may be wrong with a depth image (H, W) [m] in which there was no hand; empty when it looks sane.
+
+    Args:
+        scale_is_right: a hand was seen at this scale, so that what is out of range is only far away.
+    """
     sample = depth[::8, ::8]
     readings = sample[sample > 0]
     if readings.size == 0:
         return 'the depth image has no reading at all (all zero or not finite): is something in front of the lens?'
     outside = float(np.mean((readings < near) | (readings > far)))
-    if outside < MAX_OUTSIDE:
+    if outside < MAX_OUTSIDE or scale_is_right:
         return ''
     return (f'{outside:.0%} of the depth is outside {near:g} to {far:g} m (median {float(np.median(readings)):.3g} m): '
             'check depth_scale (0.001 for most cameras, 0.000125 for a RealSense SR305), or the range')

@@ -104,6 +104,9 @@ class HandPoseEstimator:
         near, far: range in which hands are looked for, metres.
         tracking: look first where the hands of the last image were.
         smoothing: cutoff in Hz of a filter on the joints of a tracked hand at rest (see `smoothing`); 0 = none.
+
+    Raises:
+        InputError: there is no such side or range, or not one hand to look for.
     """
 
     engine: Engine
@@ -122,6 +125,13 @@ class HandPoseEstimator:
     """Seconds that each stage of the last image took: detect, crop, predict, uncrop."""
 
     def __post_init__(self) -> None:
+        if self.side not in ('auto', 'left', 'right'):
+            raise InputError(f"unknown side '{self.side}': choose auto, left or right")
+        if self.max_hands < 1:
+            raise InputError(f'max_hands is {self.max_hands}: at least one hand is to be looked for')
+        if not 0 <= self.near < self.far:
+            raise InputError(f'hands are looked for between near and far, which are {self.near} and {self.far} m: near '
+                             'must be less, and not negative')
         self._tracks: list[_Track] = []
         self._ids = count(1)
         self._last_s: float | None = None
@@ -184,8 +194,8 @@ class HandPoseEstimator:
         intrinsics.check_lens()
         self.timings = dict.fromkeys(('detect', 'crop', 'predict', 'uncrop'), 0.0)
 
-        # Two images of one time are of a driver that does not tell it.
-        dt = FRAME_S if time_s is None or self._last_s is None else time_s - self._last_s or FRAME_S
+        elapsed = 0.0 if time_s is None or self._last_s is None else time_s - self._last_s
+        dt = elapsed if elapsed > 0 else FRAME_S  # two images of one time are of a driver that does not tell it
         self._last_s = time_s
 
         hands: list[HandEstimate] = []
@@ -309,6 +319,8 @@ class HandPoseEstimator:
             if track.filter is None or track.filter.cutoff_hz != self.smoothing:
                 track.filter = OneEuroFilter(self.smoothing)
             joints = track.filter(joints, dt)
+        else:
+            track.filter = None  # which would remember where the hand was when it is switched on again
         side: Side = self.side if self.side != 'auto' else 'right' if track.rightness >= 0 else 'left'
         return HandEstimate(joints.astype(np.float32), self.skeleton.joint_names, reading.confidence,
                             reading.score, side, reading.cube, track.id)

@@ -86,6 +86,24 @@ def test_images_that_do_not_tell_their_time_are_smoothed(sequence):
         assert moved[0] == 0 and min(moved[1:]) > 1e-4
 
 
+def test_smoothing_that_is_switched_on_again_knows_nothing_of_before(sequence):
+    estimator = HandPoseEstimator.from_pretrained(device='cpu', side='right')
+    raw = HandPoseEstimator.from_pretrained(device='cpu', side='right')
+    for k, smoothing in enumerate([0.5, 0.5, 0.5, 0.0, 0.0, 0.0, 0.5]):
+        estimator.smoothing = smoothing
+        frame = sequence[4 * k]
+        joints, plain = (each(frame.depth, frame.intrinsics)[0].joints for each in (estimator, raw))
+    np.testing.assert_array_equal(joints, plain)
+
+
+@pytest.mark.parametrize(('options', 'message'), [
+    ({'side': 'Left'}, "unknown side 'Left': choose auto"), ({'max_hands': 0}, 'max_hands is 0'),
+    ({'near': 1.0, 'far': 0.5}, 'which are 1.0 and 0.5 m')])
+def test_options_that_find_nothing_are_refused(options, message):
+    with pytest.raises(InputError, match=message):
+        HandPoseEstimator.from_pretrained(device='cpu', **options)
+
+
 @pytest.mark.parametrize('tilt', [0.0, 0.5], ids=['wall', 'table'])
 def test_a_hand_before_a_wall_or_over_a_table_is_found_and_followed(sequence, tilt):
     """The table comes nearer than the hand, at the lower edge of the image."""

@@ -355,8 +355,9 @@ def test_enable_and_reset(rig: Rig) -> None:
 def test_a_bag_that_begins_again_is_a_new_hand(rig: Rig) -> None:
     rig.start()
     publish = rig.camera(info=camera_info())
-    ids = [rig.answer(publish, image(depth_with_hand(), stamp)).hands[0].id for stamp in (1000, 1033, 1066, 1000, 1033)]
-    assert ids[0] == ids[1] == ids[2] != ids[3] == ids[4]
+    ids = [rig.answer(publish, image(depth_with_hand(), stamp)).hands[0].id
+           for stamp in (1000, 1033, 1032, 1066, 900, 933)]  # the third overtook another, or the clock was corrected
+    assert len(set(ids[:4])) == 1 and ids[3] != ids[4] == ids[5]
 
 
 def test_parameters_change_between_images_or_are_refused_with_the_reason(rig: Rig) -> None:
@@ -430,6 +431,19 @@ def test_without_camera_info_the_remedy_is_named_and_works(rig: Rig) -> None:
     node.set_parameters_atomically([Parameter(f'intrinsics.{name}', value=value) for name, value in
                                     (('fx', FOCAL), ('fy', FOCAL), ('cx', WIDTH / 2), ('cy', HEIGHT / 2))])
     assert rig.answer(publish, image(depth_with_hand())).hands
+
+
+def test_camera_info_that_was_published_once_before_the_node_came_is_taken(rig: Rig) -> None:
+    rig.client.create_publisher(CameraInfo, 'depth/camera_info', LATCHED).publish(camera_info())
+    rig.start()
+    publish, answers = rig.camera(), rig.received[HandJointsArray]
+
+    def answered() -> bool:  # the first images may come before it
+        publish(image(depth_with_hand()))
+        time.sleep(0.05)
+        return bool(answers)
+    rig.until(answered, 'an answer')
+    assert answers[0].hands
 
 
 def test_a_machine_is_not_called_slow_while_camera_info_is_missing(rig: Rig) -> None:
@@ -534,6 +548,16 @@ def test_a_wrong_depth_scale_is_suspected(rig: Rig) -> None:
     rig.start()
     rig.answer(rig.camera(info=camera_info()), image(depth_with_hand() * 10))
     rig.until_said('/depth/image_rect', 'depth_scale')
+
+
+def test_an_empty_room_is_no_wrong_depth_scale_once_a_hand_was_seen(rig: Rig) -> None:
+    rig.start()
+    publish = rig.camera(info=camera_info())
+    assert rig.answer(publish, image(depth_with_hand())).hands
+    assert rig.answer(publish, image(np.full((HEIGHT, WIDTH), 3.0))).hands == []
+    rig.answer(publish, image(np.zeros((HEIGHT, WIDTH))))
+    rig.until_said('no reading')  # which was said after all that there was to say before
+    assert not any('depth_scale' in text for text in rig.said())
 
 
 def test_silence_names_the_topic_and_its_publishers(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:

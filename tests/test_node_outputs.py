@@ -15,6 +15,7 @@ import rclpy
 from geometry_msgs.msg import PoseArray, TransformStamped
 from sensor_msgs.msg import Image, JointState, RegionOfInterest
 from std_msgs.msg import Header
+from std_srvs.srv import SetBool
 from test_node import (  # noqa: F401 (fixtures)
     FOCAL,
     HEIGHT,
@@ -95,6 +96,8 @@ def test_a_frame_for_each_joint() -> None:
     assert list(messages) == [f'l_{name}' for name in HAND21.joint_names]
     tip = messages['l_index_tip']
     assert tip.header.frame_id == 'camera' and tip.transform.rotation.w == 1
+    beside = transforms_to_msgs(Header(), [hand], '/left')  # two nodes must not be two parents of one frame
+    assert beside[0].child_frame_id == 'left/l_wrist'
     np.testing.assert_allclose(xyz([tip.transform.translation])[0], hand.joints[8])
 
 
@@ -215,8 +218,8 @@ def test_joints_in_the_target_frame(rig: Rig, monkeypatch: pytest.MonkeyPatch) -
     rig.start(target_frame='base_link', tracking=False, publish_poses=True)
     poses = listen(rig, PoseArray, 'hand/poses')
     publish = rig.camera(RELIABLE, info=camera_info())
-    there = rig.answer(publish, image(depth_with_hand(), 7))
-    assert asked == [('base_link', 'camera_optical', 7_000_000)] and there.header.frame_id == 'base_link'
+    there = rig.answer(publish, image(depth_with_hand(), 207))
+    assert asked == [('base_link', 'camera_optical', 207_000_000)] and there.header.frame_id == 'base_link'
     center = xyz([there.hands[0].cube_center])[0]
     assert center == pytest.approx((0.6, 0, 2), abs=0.15)
     rig.until(lambda: poses, 'poses')
@@ -224,11 +227,11 @@ def test_joints_in_the_target_frame(rig: Rig, monkeypatch: pytest.MonkeyPatch) -
     markers = rig.received[MarkerArray]
     rig.until(lambda: markers, 'markers')
     shown = len(markers)
-    publish(image(depth_with_hand(), 8, frame='lost'))
+    publish(image(depth_with_hand(), 208, frame='lost'))
     rig.until_said('lost', 'base_link', 'two unconnected trees')
     rig.until(lambda: len(markers) > shown, 'markers, which are in the frame of the camera')
-    assert stamp_of(rig.answer(publish, image(depth_with_hand(), 9))) == 9
-    assert [stamp_of(answer) for answer in rig.received[HandJointsArray]] == [7, 9]
+    assert stamp_of(rig.answer(publish, image(depth_with_hand(), 209))) == 209
+    assert [stamp_of(answer) for answer in rig.received[HandJointsArray]] == [207, 209]
     assert ('cleared',) not in asked
     assert stamp_of(rig.answer(publish, image(depth_with_hand(), 3))) == 3  # a bag began again
     assert ('cleared',) in asked
@@ -258,6 +261,9 @@ def test_hands_are_looked_for_in_the_region_that_is_given(rig: Rig) -> None:
     assert found(RegionOfInterest()) == []
     assert found(RegionOfInterest(x_offset=2**32 - 1, y_offset=2**32 - 1, width=2**32 - 1, height=2**32 - 1)) == []
     assert len(found(RegionOfInterest(width=2**32 - 1, height=2**32 - 1))) == 2
+    for enabled in (False, True):  # the newest holds until the next, also then
+        assert rig.call(SetBool, 'enable', data=enabled).success
+    assert len(rig.answer(rig.camera(), scene).hands) == 2
     assert not rig.set_parameter('detector', 'nearest')[0]
 
 

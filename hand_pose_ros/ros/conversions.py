@@ -124,12 +124,15 @@ def joint_states_to_msg(header: Header, hands: Sequence[HandEstimate]) -> JointS
         position=array('d', [x for _, hand in told for x in finger_angles(hand.joints, hand.side).tolist()]))
 
 
-def transforms_to_msgs(header: Header, hands: Sequence[HandEstimate]) -> list[TransformStamped]:
-    """A frame for each joint, e.g. r_index_tip, as a child of the frame of the image, and not turned against it."""
-    messages = []
+def transforms_to_msgs(header: Header, hands: Sequence[HandEstimate], namespace: str = '/') -> list[TransformStamped]:
+    """A frame for each joint, e.g. r_index_tip, as a child of the frame of the image, and not turned against it.
+
+    With the namespace of the node, such as /left, it is left/r_index_tip: all nodes publish on one /tf.
+    """
+    messages, above = [], f'{namespace.strip("/")}/'.lstrip('/')
     for prefix, hand in zip(prefixes(hands), hands, strict=True):
         for name, (x, y, z) in zip(hand.joint_names, hand.joints.tolist(), strict=True):
-            message = TransformStamped(header=header, child_frame_id=f'{prefix}{name}')
+            message = TransformStamped(header=header, child_frame_id=f'{above}{prefix}{name}')
             message.transform.translation = Vector3(x=x, y=y, z=z)
             messages.append(message)
     return messages

@@ -44,6 +44,9 @@ from hand_pose_ros.ros.worker import NewestWorker
 _Transition = Callable[['EstimatorNode', LifecycleState], TransitionCallbackReturn]
 SILENCE_S = 5.0
 """Images that stay away for so long are worth a warning."""
+BACK_NS = 100_000_000
+"""An image that is older than the one before by more than this is of a bag that began again; clocks are corrected, and
+images overtake each other, by less."""
 
 
 def _logged(transition: _Transition) -> _Transition:
@@ -73,6 +76,7 @@ class EstimatorNode(LifecycleNode):
         self._estimator: HandPoseEstimator | None = None
         self._worker: NewestWorker[Image | CompressedImage] | None = None
         self._inputs: list[Subscription] = []
+        self._latched: Subscription | None = None  # to a camera_info that was published before the node came
         self._published = False  # does anybody publish images?
         self._reset = False  # asked for; the worker, who alone touches the estimator, does it
         super().__init__('estimator', **kwargs)
@@ -101,6 +105,8 @@ class EstimatorNode(LifecycleNode):
         self._outputs = Outputs(self, estimator, self._params, self._complain)
         self._image_topic, info_topic = topics.input_topics(self, self._params.transport)
         self._camera = Camera(info_topic)
+        self._regions: list[Region] = []
+        self._scale_is_right = False
         self._estimator = estimator
         return super().on_configure(state)
 
@@ -155,7 +161,6 @@ class EstimatorNode(LifecycleNode):
         self._camera.open()
         self._last_header, self._reset = Header(), True  # whoever is there now need not be who was there before
         self._heard_at, self._statistics.silence = time.monotonic(), ''
-        self._regions: list[Region] = []
         inputs = [(CameraInfo, self._camera.topic, self._on_camera_info),
                   (self._image_type, self._image_topic, self._on_image)]
         if self._params.detector == 'region':
@@ -168,6 +173,9 @@ class EstimatorNode(LifecycleNode):
     def _stop(self) -> None:
         while self._inputs:
             self.destroy_subscription(self._inputs.pop())
+        if self._latched is not None:
+            self.destroy_subscription(self._latched)
+            self._latched = None
         if self._worker is None:
             return
         self._camera.close()
@@ -218,15 +226,19 @@ class EstimatorNode(LifecycleNode):
         if published and not self._published:  # who has just come, as a bag that is replayed, may take its time
             self._heard_at = time.monotonic()
         self._published = published
+        if listening and self._latched is None:
+            self._latched = topics.subscribe_latched(self, CameraInfo, self._camera.topic, self._camera.update)
         if listening and time.monotonic() - self._heard_at > SILENCE_S:
             silence = topics.explain_silence(self, self._image_topic, self._image_type, SILENCE_S)
             if silence != self._statistics.silence:  # who publishes what may change meanwhile, and the remedy with it
                 self._statistics.silence = silence
-                self._complain(silence)
+                self._statistics.problem(silence)
+            self._say(silence)
         if listening and self.count_publishers(self._outputs.joints_topic) > 1:
             self._complain(f'somebody else publishes {self._outputs.joints_topic}, too: stop one of them, or give each '
                            'a namespace (--ros-args -r __ns:=/left)')
-        status = self._statistics.report(self.get_name(), self._state, published, self._facts())
+        name = self.get_fully_qualified_name().lstrip('/')  # nodes of other namespaces tell there, too
+        status = self._statistics.report(name, self._state, published, self._facts())
         if status.level == DiagnosticStatus.WARN:
             self._say(status.message)
         if self._params.publish_diagnostics:
@@ -287,7 +299,7 @@ class EstimatorNode(LifecycleNode):
         regions = self._regions if params.detector == 'region' else None
         assert estimator is not None
         params.apply(estimator)
-        began_again = stamp_ns(header) < stamp_ns(self._last_header)
+        began_again = stamp_ns(header) < stamp_ns(self._last_header) - BACK_NS
         if began_again:
             self._outputs.begin_again()
         if began_again or self._reset:
@@ -298,7 +310,9 @@ class EstimatorNode(LifecycleNode):
             self._complain(f'{self._image_topic}: {problem}')
         hands = estimator(depth, intrinsics, time_s=stamp_ns(header) / 1e9 or None, regions=regions)
         self._statistics.time(**estimator.timings)
-        problem = topics.NO_REGION if regions == [] else depth_problem(depth, params.min_depth, params.max_depth)
+        self._scale_is_right |= bool(hands)
+        problem = topics.NO_REGION if regions == [] else depth_problem(
+            depth, params.min_depth, params.max_depth, self._scale_is_right)
         if not hands and problem:
             self._complain(f'{self._image_topic}: {problem}')
         return hands

@@ -81,7 +81,7 @@ class Outputs:
             self._states_pub.publish(conversions.joint_states_to_msg(header, hands))
         if self._tf_pub is not None and hands:
             if header.frame_id:
-                transforms = conversions.transforms_to_msgs(header, hands)
+                transforms = conversions.transforms_to_msgs(header, hands, self._node.get_namespace())
                 self._tf_pub.publish(self._tf_pub.msg_type(transforms=transforms))
             else:
                 self._complain('the frame_id of the depth image is empty, so the joints have no place in tf: let the '

@@ -61,8 +61,8 @@ class Params:
     side: str = _parameter('auto', 'Which hands there are; auto finds out.', choices=('auto', 'left', 'right'))
     max_hands: int = _parameter(2, 'At most this many hands per image. While there are fewer, every fifth image takes '
                                 'longer, for it is searched for more.', low=1, high=8)
-    min_score: float = _parameter(0.4, 'Hands with a lower score are not reported; a new hand must begin with its '
-                                   'square root (0.63 for 0.4).', low=0.0, high=1.0)
+    min_score: float = _parameter(0.4, 'Hands with a lower score are not reported; a new one beside another must '
+                                   'begin with its square root (0.63 for 0.4).', low=0.0, high=1.0)
     detector: str = _parameter('network', 'How new hands are found: by a small network; as what is nearest to the '
                                'camera, as in the paper; or by the network within the newest region of hand/region '
                                '(sensor_msgs/RegionOfInterest, in pixels of the depth image; one without width or '

@@ -56,6 +56,17 @@ def subscribe(node: Node, message_type: type, topic: str, callback: Callable[...
                             f'qos_overrides.{topic}.subscription.*') from error
 
 
+def subscribe_latched(node: Node, message_type: type, topic: str, callback: Callable[..., None]) -> Subscription | None:
+    """Listen, too, to what was said once, where all publishers keep it for whoever comes later (transient local).
+
+    Others would be told, and tell their user, that somebody wants of them what they do not offer.
+    """
+    infos = node.get_publishers_info_by_topic(topic)
+    if not infos or any(info.qos_profile.durability != qos.LATCHED.durability for info in infos):
+        return None
+    return node.create_subscription(message_type, topic, callback, qos.LATCHED)
+
+
 def describe_publishers(node: Node, topic: str) -> str:
     """Who publishes on a topic and how, e.g. `published by /camera (sensor_msgs/msg/Image, best effort, volatile)`."""
     publishers = [

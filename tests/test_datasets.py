@@ -1,7 +1,9 @@
 """Datasets are read in the formats they are distributed in, and samples are kept on disk without surprises."""
 
 import gzip
+import logging
 import multiprocessing
+import os
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -191,9 +193,17 @@ def test_msra_leaves_one_subject_out_and_goes_by_file_name(tmp_path):
 
 # Bags
 
+BAG_CAMERA = Intrinsics(300, 300, 160, 120, 320, 240)
+
+
+def write_hand(bag: BagWriter, stamp: int, side: str, joints: np.ndarray) -> None:
+    bag.write_hands(stamp, 'camera', [SimpleNamespace(
+        id='0', side=side, score=1.0, joints=joints, confidence=np.ones(21, np.float32),
+        cube=Cube((0.1, 0.0, 0.5), 0.3))], HAND21)
+
+
 def test_bags(tmp_path):
-    rng, camera = np.random.default_rng(4), Intrinsics(300, 300, 160, 120, 320, 240)
-    (tmp_path / 'train').mkdir()
+    rng, camera = np.random.default_rng(4), BAG_CAMERA
     hands = []
     with BagWriter(tmp_path / 'train' / 'mine.mcap') as bag:
         for i, side in enumerate(('left', 'right', 'right')):
@@ -202,9 +212,7 @@ def test_bags(tmp_path):
             bag.write_depth(1000 + i, 'camera', blob(camera, joints.mean(0)), camera)
             if i == 1:
                 continue  # a frame without a label
-            bag.write_hands(1000 + i, 'camera', [SimpleNamespace(
-                id='0', side=side, score=1.0, joints=joints, confidence=np.ones(21, np.float32),
-                cube=Cube((0.1, 0.0, 0.5), 0.3))], HAND21)
+            write_hand(bag, 1000 + i, side, joints)
     dataset = open_dataset('bags', 'train', tmp_path)
     assert dataset.size == 2 and dataset.skeleton.name == 'hand21' and dataset.cube_side == 0.3
     batch = dataset.batch(torch.tensor([1, 0]))
@@ -214,6 +222,57 @@ def test_bags(tmp_path):
     assert (batch['patch'] < 1).float().mean() > 0.05
     with pytest.raises(DatasetError, match='val holds no bags'):
         open_dataset('bags', 'val', tmp_path)
+
+
+def test_bags_that_were_corrected_are_not_read_from_the_cache(tmp_path):
+    joints = scattered(np.random.default_rng(4), 21, np.array([0.1, 0.0, 0.5]))
+    path = tmp_path / 'train' / 'mine.mcap'
+
+    def recorded(camera: Intrinsics, side: str, seconds: int) -> str:
+        with BagWriter(path) as bag:
+            bag.write_depth(1000, 'camera', blob(BAG_CAMERA, joints.mean(0)), camera)
+            write_hand(bag, 1000, side, joints)
+        os.utime(path, (seconds, seconds))
+        return open_dataset('bags', 'train', tmp_path).fingerprint
+
+    first = recorded(BAG_CAMERA, 'right', 1)
+    assert recorded(BAG_CAMERA, 'right', 1) == first
+    assert recorded(BAG_CAMERA, 'left', 1) != first
+    assert recorded(Intrinsics(310, 310, 160, 120, 320, 240), 'right', 2) != first
+
+
+def test_images_of_a_bag_are_found_in_whatever_order_they_were_recorded(tmp_path):
+    rng, path = np.random.default_rng(4), tmp_path / 'train' / 'mine.mcap'
+    middles = {stamp: np.array([0.0, 0.0, 0.4 + 0.1 * i]) for i, stamp in enumerate((1000, 1001, 1002))}
+    with BagWriter(path) as bag:
+        write = bag.write_serialized
+        for at, stamp in enumerate((1001, 1002, 1000)):
+            bag.write_serialized = lambda topic, kind, data, _, at=at, **more: write(topic, kind, data, at, **more)
+            bag.write_depth(stamp, 'camera', blob(BAG_CAMERA, middles[stamp]), BAG_CAMERA)
+            write_hand(bag, stamp, 'right', scattered(rng, 21, middles[stamp]))
+        write_hand(bag, 1003, 'right', scattered(rng, 21, middles[1000]))
+    dataset = open_dataset('bags', 'train', tmp_path)
+    for index in (0, 1, 2, 1):
+        depth = dataset.frame(index).depth
+        np.testing.assert_allclose(depth, blob(BAG_CAMERA, middles[1000 + index]), atol=0.001)
+    with pytest.raises(DatasetError, match=r'mine\.mcap has hands with the stamp 1003 ns, but no depth image with it'):
+        dataset.frame(3)
+
+
+def test_hands_without_a_joint_are_left_out_and_those_without_a_side_are_told_of(tmp_path, caplog):
+    joints = scattered(np.random.default_rng(4), 21, np.array([0.1, 0.0, 0.5]))
+    lost, unset = joints.copy(), joints.copy()
+    lost[7], unset[:] = np.nan, 0
+    with BagWriter(tmp_path / 'train' / 'mine.mcap') as bag:
+        for stamp, (side, each) in enumerate((('right', joints), ('left', lost), ('unknown', joints), ('left', unset))):
+            bag.write_depth(stamp, 'camera', blob(BAG_CAMERA, joints.mean(0)), BAG_CAMERA)
+            write_hand(bag, stamp, side, each)
+    with caplog.at_level(logging.WARNING):
+        dataset = open_dataset('bags', 'train', tmp_path)
+    assert dataset.size == 2 and dataset.batch(torch.arange(2))['joints'].isfinite().all()
+    left_out, sideless = caplog.messages
+    assert 'mine.mcap: 2 of 4 hands' in left_out and 'left out' in left_out
+    assert 'mine.mcap: the side of 1 of 2 hands is unknown' in sideless
 
 
 # All of them

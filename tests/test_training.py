@@ -9,6 +9,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ import torch
 from safetensors.torch import load_file
 from torch import nn
 
+from hand_pose_ros.bags import BagWriter
 from hand_pose_ros.cli import main
 from hand_pose_ros.cli.experiment import NAMES
 from hand_pose_ros.datasets import Batch, Dataset, icvl, joints_in_metres, open_dataset
@@ -26,7 +28,7 @@ from hand_pose_ros.geometry import Cube, Intrinsics, crop
 from hand_pose_ros.models import build
 from hand_pose_ros.models.checkpoints import load_checkpoint, save_checkpoint
 from hand_pose_ros.models.prior import fit_prior
-from hand_pose_ros.skeleton import HAND21
+from hand_pose_ros.skeleton import HAND21, Skeleton, get_skeleton
 from hand_pose_ros.training import experiments
 from hand_pose_ros.training.augmentation import PRESETS, Augmentation, augment
 from hand_pose_ros.training.folder import TrainingError
@@ -300,7 +302,10 @@ def test_any_value_of_a_recipe_can_be_replaced():
 @pytest.mark.parametrize(('override', 'message'), [
     ('lr=1', "no 'lr'"), ('samples=many', 'not of type'), ('samples=1.5', 'not of type'), ('seed', 'key=value'),
     ('samples=-5', '--set samples=-5: must be at least 1'), ('batch_size=0', 'at least 1'), ('seed=-1', 'at least 0'),
-    ('seed=20261126', 'less than 4194304'),
+    ('seed=20261126', 'at most 4194303'), ('learning_rate=-1', r'learning_rate=-1: must be at least 1e-09'),
+    ('knee=0', 'at least 1e-06'), ('weight_decay=-1', 'at least 0'), ('warmup=2', 'at most 1'),
+    ('augmentation.scale=0', r'--set augmentation\.scale=0: must be at least 1'),
+    ('augmentation.dropout=2', 'at most 1'), ('augmentation.jitter=8', r'at most 0\.1'),
     ('augmentation=strong', 'choose one of'), ('augmentation.strong=1', "no 'strong'"), ('seed.x=1', 'is one value')])
 def test_a_wrong_override_is_one_sentence(override, message):
     with pytest.raises(HandPoseError, match=message):
@@ -469,6 +474,49 @@ def test_a_run_that_was_stopped_in_its_last_validation_does_it_when_resumed(fold
     assert not (tmp_path / 'stopped' / 'best.safetensors').exists()
     assert tiny(folder, 'samples=40', out=tmp_path / 'stopped').train(resume=True) == expected
     assert (tmp_path / 'stopped' / 'best.safetensors').exists()
+    assert tiny(folder, 'samples=40', out=tmp_path / 'stopped').train(resume=True) == expected  # finished already
+    assert len(validations(tmp_path / 'stopped')) == 1
+
+
+def test_a_validation_that_fails_costs_no_training_and_is_made_up_for(folder, tmp_path):
+    tiny(folder, out=tmp_path / 'whole').train()
+    run = tiny(folder, out=tmp_path / 'failed')
+
+    def full(*_):
+        raise HandPoseError('the disk is full')
+    run._save_checkpoint = full
+    with pytest.raises(HandPoseError, match='disk is full'):
+        run.train()
+    assert run_state(run.folder.state)['step'] == 10
+    tiny(folder, out=tmp_path / 'failed').train(resume=True)
+    assert same_state(tmp_path / 'whole', tmp_path / 'failed')
+    assert validations(tmp_path / 'failed') == validations(tmp_path / 'whole')
+
+
+def validations(run: Path) -> list[dict]:
+    return [row for row in map(json.loads, (run / 'metrics.jsonl').open()) if 'val_mm' in row]
+
+
+def test_validation_data_that_cannot_be_used_are_told_before_the_training(tmp_path):
+    def bag(split: str, skeleton: Skeleton) -> None:
+        joints = np.array([0, 0, 0.5]) + np.random.default_rng(0).uniform(-0.05, 0.05, (len(skeleton), 3))
+        hand = SimpleNamespace(id='0', side='right', score=1.0, joints=joints, confidence=np.ones(len(skeleton)),
+                               cube=Cube((0.0, 0.0, 0.5), 0.3))
+        with BagWriter(tmp_path / split / 'hand.mcap') as file:
+            file.write_depth(0, 'camera', np.full((480, 640), 0.5, np.float32), CAMERA)
+            file.write_hands(0, 'camera', [hand], skeleton)
+
+    def run() -> Run:
+        recipe = get_recipe('paper', ['dataset=bags', f'root={tmp_path}', 'options.bottleneck=none'])
+        return Run(tmp_path / 'run', recipe, Machine(tmp_path / 'cache', workers=0))
+    bag('train', HAND21)
+    with pytest.raises(HandPoseError, match='val holds no bags'):
+        run()
+    bag('val', get_skeleton('icvl16'))
+    with pytest.raises(TrainingError, match='bags-val has joints of icvl16, but bags-train those of hand21'):
+        run()
+    bag('val', HAND21)
+    run()
 
 
 def run_state(path: Path) -> dict:
@@ -548,6 +596,8 @@ def test_a_refiner_learns_from_what_its_base_has_not_seen(folder, tmp_path):
     run = tiny(folder, 'refiner=or_ref', f'base={base}', 'optimizer=adamw', 'learning_rate=0.001', 'samples=160',
                out=tmp_path / 'refined')
     assert list(run.stream.window(0)) == [2, 3]
+    other = tiny(folder, 'refiner=or_ref', f'base={base}', 'shard_size=3', out=tmp_path / 'never')
+    assert list(other.stream.window(0)) == [3, 4, 5]  # of 16 samples, of which the base has seen 8
     run.train()
     refined, before = load_checkpoint(tmp_path / 'refined' / 'last.safetensors'), load_checkpoint(base)
     kept = refined.network.state_dict()

@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import logging
+import multiprocessing
 from collections.abc import Iterator
 from pathlib import Path
+
+import numpy as np
 
 from hand_pose_ros.bags.reader import DepthBag, Frame, RecordedHands, check_frame, read_hands
 from hand_pose_ros.datasets.base import DatasetError, LabelledFrame, RecordedDataset, fingerprint
 from hand_pose_ros.skeleton import Skeleton, get_skeleton
 
+log = logging.getLogger(__name__)
+
 SUFFIXES = ('.bag', '.mcap', '.db3')
+
+_Sample = tuple[Path, RecordedHands, int]
+"""A bag, the hands of one image, and which of them."""
 
 
 class Bags(RecordedDataset):
     """`root`/{train,val,test}/ with bags in each, so that no recording is in two splits.
 
-    Every hand of every HandJointsArray is a sample; its depth image is the one with the same stamp.
+    Every hand of every HandJointsArray is a sample; its depth image is the one with the same stamp. Hands that lack a
+    joint are left out, and those whose side is unknown are taken for right hands; the log says how many.
     """
 
     skeleton: Skeleton
@@ -26,19 +36,17 @@ class Bags(RecordedDataset):
                       if path.suffix in SUFFIXES or (path / 'metadata.yaml').exists())
         if not bags:
             raise DatasetError(f'bags: {root / split} holds no bags (.mcap, .bag, .db3, or folders with metadata.yaml)')
-        self._samples: list[tuple[Path, RecordedHands, int]] = []
-        for bag in bags:
-            for hands in sorted(read_hands(bag), key=lambda hands: hands.stamp_ns):
-                self._samples += [(bag, hands, i) for i in range(len(hands.joints))]
+        self._samples = [sample for bag in bags for sample in _read(bag)]
         names = {hands.skeleton for _, hands, _ in self._samples}
         if len(names) != 1:
             raise DatasetError(f'bags: {root / split} must hold hands of one skeleton, '
                                f'not of {", ".join(sorted(names)) or "none"}')
         self.skeleton = get_skeleton(names.pop())
         self.size = len(self._samples)
-        self._reading: tuple[DepthBag, Iterator[Frame], Frame] | None = None
-        self.fingerprint = fingerprint(self.name, *(
-            f'{bag.stem}{hands.stamp_ns}{hands.joints[i].tolist()}'.encode() for bag, hands, i in self._samples))
+        self._reading: tuple[Path, Iterator[Frame], Frame] | None = None
+        self.fingerprint = fingerprint(self.name, *map(_contents, bags), *(
+            f'{bag.stem}{hands.stamp_ns}{hands.sides[i]}{hands.joints[i].tolist()}'.encode()
+            for bag, hands, i in self._samples))
 
     def frame(self, index: int) -> LabelledFrame:
         bag, hands, i = self._samples[index]
@@ -49,20 +57,49 @@ class Bags(RecordedDataset):
                              hands.sides[i] == 'left')
 
     def _image(self, bag: Path, stamp_ns: int) -> Frame:
-        """A bag is read in the order of recording, so samples in the order of their index cost one pass over it."""
-        if self._reading and (self._reading[0].path != bag or self._reading[2].stamp_ns > stamp_ns):
-            self._reading[0].close()
-            self._reading = None
-        if self._reading is None:
-            opened = DepthBag(bag)
-            frames = iter(opened)
-            self._reading = opened, frames, next(frames)
-        opened, frames, frame = self._reading
-        while frame.stamp_ns < stamp_ns:
-            frame = next(frames, frame)
-            if frame is self._reading[2]:
-                break
-            self._reading = opened, frames, frame
-        if frame.stamp_ns != stamp_ns:
-            raise DatasetError(f'bags: {bag} has hands with the stamp {stamp_ns} ns, but no depth image with it')
-        return frame
+        """A bag is read in the order of recording, so samples in the order of their index cost one pass over it, and
+        another one wherever stamps are out of that order."""
+        attempts = [_images(bag)]  # which opens it only if it comes to that
+        if self._reading and self._reading[0] == bag:
+            _, images, last = self._reading
+            if last.stamp_ns == stamp_ns:
+                return last
+            if last.stamp_ns < stamp_ns:
+                attempts.insert(0, images)
+        for images in attempts:
+            for frame in images:
+                if frame.stamp_ns == stamp_ns:
+                    self._reading = bag, images, frame
+                    return frame
+        raise DatasetError(f'bags: {bag} has hands with the stamp {stamp_ns} ns, but no depth image with it')
+
+
+def _read(bag: Path) -> list[_Sample]:
+    """The hands of a bag in the order of their stamps."""
+    samples: list[_Sample] = []
+    count = 0
+    for hands in sorted(read_hands(bag), key=lambda hands: hands.stamp_ns):
+        # As in evaluation, a joint that is not finite or not in front of the camera is not labelled.
+        whole = np.isfinite(hands.joints).all((1, 2)) & (hands.joints[..., 2] > 0).all(1)
+        samples += [(bag, hands, i) for i in np.flatnonzero(whole).tolist()]
+        count += len(hands.joints)
+    sideless = sum(hands.sides[i] == 'unknown' for _, hands, i in samples)
+    if multiprocessing.parent_process() is None:  # those that make samples need not say it again
+        if len(samples) < count:
+            log.warning('bags: %s: %s of %s hands have a joint that is not finite or not in front of the camera, and '
+                        'are left out', bag, count - len(samples), count)
+        if sideless:
+            log.warning('bags: %s: the side of %s of %s hands is unknown, and they are taken for right hands: write '
+                        'the side of those that are left ones', bag, sideless, len(samples))
+    return samples
+
+
+def _images(bag: Path) -> Iterator[Frame]:
+    with DepthBag(bag) as opened:
+        yield from opened
+
+
+def _contents(bag: Path) -> bytes:
+    """Changes with the depth and the cameras in a bag, of which reading every byte would take minutes."""
+    files = sorted(path for path in bag.rglob('*') if path.is_file()) if bag.is_dir() else [bag]
+    return ''.join(f'{path.name}{path.stat().st_size}-{path.stat().st_mtime_ns}' for path in files).encode()

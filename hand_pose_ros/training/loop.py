@@ -94,11 +94,18 @@ class Run:
         self.device = torch.device(machine.device)
         if self.device.type == 'cuda' and 'LOCAL_RANK' in os.environ:
             self.device = torch.device('cuda', int(os.environ['LOCAL_RANK']))
+        if self.device.type == 'cuda' and self.device.index is not None:
+            torch.cuda.set_device(self.device)  # the current one is where graphs are captured
 
         torch.manual_seed(recipe.seed)
         self.base = load_checkpoint(recipe.base) if recipe.base else None
         self.shards = open_shards(recipe, machine, 'train', self.device)
         self.skeleton = self.shards.dataset.skeleton
+        # Now, not after the first 65,536 samples, for it may not be there.
+        self._val_shards = open_shards(recipe, machine, 'val', self.device)
+        if (other := self._val_shards.dataset.skeleton.name) != self.skeleton.name:
+            raise TrainingError(f'{self._val_shards.dataset.name} has joints of {other}, but '
+                                f'{self.shards.dataset.name} those of {self.skeleton.name}: they must be the same')
         if recipe.last_shard is not None and self.shards.dataset.size is None:
             raise TrainingError(f'--set last_shard={recipe.last_shard} is for recorded datasets: {recipe.dataset} '
                                 'has no end; --set samples=N says how much of it is seen')
@@ -121,6 +128,8 @@ class Run:
         self._aside = torch.cuda.Stream(self.device, priority=-1) if self.device.type == 'cuda' else None
         self.step, self.best_mm = 0, float('inf')
         self._validated = 0  # step
+        self._result: dict[str, Any] = {}
+        """Of the last validation."""
         self._saved = time.monotonic()
 
     # What is trained, on what
@@ -129,7 +138,9 @@ class Run:
         """A refiner starts behind what its base was trained on."""
         first, data = self.recipe.first_shard, self.shards.dataset
         if self.recipe.refiner and self.base and self.base.metadata.get('training_data') == data.name:
-            first = max(first, int(self.base.metadata['training_shards']))
+            size = self.base.metadata.get('recipe', {}).get('shard_size', self.recipe.shard_size)
+            seen = int(self.base.metadata['training_shards']) * size
+            first = max(first, -(-seen // self.recipe.shard_size))
             if data.size is not None and first * self.recipe.shard_size >= data.size:
                 raise TrainingError(f'{self.recipe.base} was trained on all of {data.name}, so a refiner would learn '
                                     'from estimates that are better than in use: train the base with --set '
@@ -252,7 +263,8 @@ class Run:
             self.step, self.best_mm = progress['step'], progress['best_mm'] or float('inf')
             if progress['data'] != self.shards.dataset.fingerprint:
                 log.warning('the training data, or the code that makes them, have changed since step %s', self.step)
-            if self.step >= self.steps and self.rank == 0:
+            self._validated, self._result = progress.get('validated', 0), progress.get('result', {})
+            if self._validated >= self.steps and self.rank == 0:
                 log.info('the run in %s is finished already', self.folder.path)
         elif self.rank == 0:
             self.folder.create(self.recipe)
@@ -264,20 +276,19 @@ class Run:
     def _loop(self, module: nn.Module) -> dict[str, Any]:
         recipe = self.recipe
         gradients = Gradients(module, self._autocast, captured=self.device.type == 'cuda' and self.world == 1)
-        result: dict[str, Any] = {}
         since, at = self.step, time.monotonic()
         told = at
         with tqdm(total=self.budget, initial=self.step * recipe.batch_size, unit='samples', unit_scale=True,
                   smoothing=0.05, disable=self.rank > 0 or None, dynamic_ncols=True) as bar:
-            if self.step >= self.steps:  # the run was stopped while it validated for the last time
-                result = self._validate()
+            if self._validated < self.step and self._to_validate():  # the run was stopped before it had
+                self._validate()
             while self.step < self.steps:
                 terms = self._train_step(gradients)
                 bar.update(recipe.batch_size)
                 done, last = self.step * recipe.batch_size, self.step == self.steps
                 if (self.step % 50 == 0 or last) and self.rank == 0:
                     values = {name: round(float(value), 6) for name, value in terms.items()}
-                    bar.set_postfix({**values, **result})
+                    bar.set_postfix({**values, **self._result})
                     rate = (self.step - since) * recipe.batch_size / (time.monotonic() - at)
                     since, at = self.step, time.monotonic()
                     if bar.disable and at - told > TOLD_EVERY_S:  # no terminal: a line now and then
@@ -287,12 +298,17 @@ class Run:
                                        'learning_rate': self.optimizer.param_groups[0]['lr']})
                 if self._ending and not last:
                     raise KeyboardInterrupt
-                if last or done // recipe.val_every > (done - recipe.batch_size) // recipe.val_every:
-                    result = self._validate()
-                    self._save()
+                if self._to_validate():
+                    self._save()  # what is trained is not to be lost with a validation that fails
+                    self._validate()
                 elif time.monotonic() - self._saved > self.machine.save_every_s:
                     self._save()
-        return result
+        return self._result
+
+    def _to_validate(self) -> bool:
+        """Whether the last step is one to validate after."""
+        done, size, every = self.step * self.recipe.batch_size, self.recipe.batch_size, self.recipe.val_every
+        return self.step >= self.steps or done // every > (done - size) // every
 
     def _train_step(self, gradients: Gradients) -> Terms:
         """One step; all it depends on are the weights, the state of the optimiser, the recipe and the step's number."""
@@ -393,27 +409,27 @@ class Run:
 
     # Validation and files
 
-    def _validate(self) -> dict[str, Any]:
+    def _validate(self) -> None:
         """Mean error on identities that training does not see, by rank 0; the best network so far is kept."""
         if self.rank:
-            return {}
+            return
         objective = self.averaged.eval()
         estimates, truths = estimate(objective.predict, self._validation, self.device, objective.joints)
         errors = 1000 * (estimates - truths).norm(dim=-1)
         within = {f'val_within_{mm}': round(float((errors.amax(1) <= mm).float().mean()), 4) for mm in (20, 30, 40)}
         result = {'val_mm': round(float(errors.mean()), 3), **within}
-        self.folder.write({'step': self.step, 'samples': self.step * self.recipe.batch_size, **result})
         log.info('%s samples: %s', f'{self.step * self.recipe.batch_size:,}', result)
         if result['val_mm'] < self.best_mm:
             self.best_mm = result['val_mm']
             self._save_checkpoint('best', result)
         self._save_checkpoint('last', result)
-        self._validated = self.step
-        return result
+        self.folder.write({'step': self.step, 'samples': self.step * self.recipe.batch_size, **result})
+        self._validated, self._result = self.step, result
+        self._save()
 
     @cached_property
     def _validation(self) -> list[Batch]:
-        with closing(open_shards(self.recipe, self.machine, 'val', self.device)) as shards, self._interruptible():
+        with closing(self._val_shards) as shards, self._interruptible():
             return first_samples(shards, self.recipe.val_samples)
 
     def _save_checkpoint(self, name: str, result: dict[str, Any]) -> None:
@@ -433,6 +449,7 @@ class Run:
         self._saved = time.monotonic()
         if self.rank == 0:
             save_state(self.folder.state, self._modules(), self.optimizer,
-                       {'step': self.step, 'finished': self.step >= self.steps,
+                       {'step': self.step, 'finished': self._validated >= self.steps, 'validated': self._validated,
+                        'result': self._result,
                         'data': self.shards.dataset.fingerprint,
                         'best_mm': self.best_mm if self.best_mm < float('inf') else None})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
@@ -76,6 +77,14 @@ class Recipe:
 
 EPOCH_OF_ENDLESS_DATA = 72_757
 
+_RANGES: dict[str, tuple[float, float]] = {
+    'knee': (1e-6, math.inf), 'learning_rate': (1e-9, math.inf), 'seed': (0, MAX_SEED - 1), 'rotation_deg': (0, 180),
+    'scale': (1, 2), **dict.fromkeys(('jitter', 'noise'), (0, 0.1)),
+    **dict.fromkeys(('first_shard', 'last_shard', 'weight_decay'), (0, math.inf)),
+    **dict.fromkeys(('warmup', 'momentum', 'average', 'jitter_tail', 'dropout', 'erase', 'mirror'), (0, 1)),
+}
+"""What a number of a recipe or its augmentation may be; where nothing is said, at least 1."""
+
 RECIPES = {
     # The paper, section 4.1. It gives neither the knee of its Huber loss nor a schedule: those are ours.
     'paper': Recipe(),
@@ -105,7 +114,7 @@ def get_recipe(name: str, overrides: Iterable[str] = ()) -> Recipe:
             'options.bottleneck=8', 'augmentation.jitter=0.01', 'augmentation=modern', 'base=none'.
 
     Raises:
-        HandPoseError: no such recipe or key, or a value of the wrong kind.
+        HandPoseError: no such recipe or key, or a value of the wrong kind or out of range.
     """
     if name not in RECIPES:
         raise HandPoseError(f"unknown recipe '{name}': choose one of {', '.join(RECIPES)}")
@@ -147,11 +156,10 @@ def _replace(target: T, keys: list[str], text: str, item: str) -> T:
         value = PRESETS[text]
     else:
         value = _convert(text, fields[key], item)
-        least = 0 if key in ('first_shard', 'last_shard', 'seed') else 1
-        if 'int' in fields[key] and value is not None and value < least:
-            raise HandPoseError(f'--set {item}: must be at least {least}')
-        if key == 'seed' and value >= MAX_SEED:
-            raise HandPoseError(f'--set {item}: must be less than {MAX_SEED}')
+        least, most = _RANGES.get(key, (1, math.inf))
+        if type(value) in (int, float) and not least <= value <= most:  # a bool is no number here
+            raise HandPoseError(f'--set {item}: must be '
+                                + (f'at least {least}' if value < least else f'at most {most}'))
     return dataclasses.replace(target, **{key: value})  # type: ignore[type-var]
 
 

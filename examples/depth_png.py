@@ -33,6 +33,8 @@ def main() -> None:
             print(f'  {name:<12}{x:+.3f} {y:+.3f} {z:.3f} m   {confidence:.2f}')
     if not hands:
         print('no hand')
+    if args.picture and not cv2.haveImageWriter(args.picture):
+        sys.exit(f'{args.picture}: the kind of picture is told by the end of its name: end it in .png or .jpg')
     if args.picture and not cv2.imwrite(args.picture, overlay(depth, intrinsics, hands)):
         sys.exit(f'{args.picture} cannot be written: is there such a folder?')
 

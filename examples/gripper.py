@@ -4,7 +4,8 @@
     python examples/gripper.py --ros-args -r gripper/commands:=/gripper_controller/commands -p max_opening:=0.08
 
 It listens to the node: start that first, as for examples/subscribe.py. The command is the opening in metres, as a
-forward_command_controller takes it. Without a hand that can be trusted the gripper stays as it is.
+forward_command_controller takes it. Without a hand that can be trusted the gripper stays as it is. It is taken to be
+open at the start: open it before.
 """
 
 import numpy as np
@@ -15,6 +16,7 @@ from std_msgs.msg import Float64MultiArray
 
 from hand_pose_ros.angles import ANGLES, finger_angles
 from hand_pose_ros.msg import HandJoints, HandJointsArray
+from hand_pose_ros.skeleton import HAND21
 
 SIDES = {HandJoints.LEFT: 'left', HandJoints.RIGHT: 'right'}
 PIP = [ANGLES.index(f'{finger}_pip_flexion') for finger in ('index', 'middle', 'ring', 'pinky')]
@@ -34,21 +36,25 @@ class Gripper(Node):
     def __init__(self) -> None:
         super().__init__('gripper')
         self.max_opening = self.declare_parameter('max_opening', 0.08).value
-        self.opening, self.moved = None, self.get_clock().now()
+        self.opening, self.moved = self.max_opening, self.get_clock().now()
         self.commands = self.create_publisher(Float64MultiArray, 'gripper/commands', 10)
         self.create_subscription(HandJointsArray, 'hand/joints', self.on_hands, 10)
 
     def on_hands(self, message: HandJointsArray) -> None:
+        if message.skeleton != HAND21.name:
+            self.get_logger().error(f"hand/joints has the joints of '{message.skeleton}': start the node with a model "
+                                    'of hand21, such as the default', once=True)
+            return
         hand = max(message.hands, key=lambda hand: hand.score, default=None)
         if hand is None or hand.score < MIN_SCORE or hand.side not in SIDES:
             return
         joints = np.array([(point.x, point.y, point.z) for point in hand.joints])
         wanted = self.max_opening * (1 - closing(joints, SIDES[hand.side]))
         now = self.get_clock().now()
-        reach = SPEED * min((now - self.moved).nanoseconds / 1e9, 0.1)
-        if self.opening is None:
-            self.opening = wanted
-        self.opening = float(np.clip(wanted, self.opening - reach, self.opening + reach))
+        # Clocks jump: back when a bag begins again, and far ahead after a pause.
+        reach = SPEED * np.clip((now - self.moved).nanoseconds / 1e9, 0, 0.1)
+        step = np.clip(wanted - self.opening, -reach, reach)
+        self.opening = float(np.clip(self.opening + step, 0, self.max_opening))
         self.moved = now
         self.commands.publish(Float64MultiArray(data=[self.opening]))
         self.get_logger().info(f'opening {self.opening:.3f} m', throttle_duration_sec=1.0)

@@ -8,14 +8,16 @@ It needs ROS 2, for example from pip install '.[ros]'. Where there is compressed
 the node with --ros-args -p transport:=compressedDepth.
 """
 
+import sys
+
 import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 
+from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.msg import HandJoints, HandJointsArray
-from hand_pose_ros.skeleton import HAND21
+from hand_pose_ros.skeleton import get_skeleton
 
-INDEX_TIP = HAND21.joint_names.index('index_tip')
 SIDES = {HandJoints.LEFT: 'left', HandJoints.RIGHT: 'right', HandJoints.UNKNOWN: 'unknown'}
 
 
@@ -31,9 +33,10 @@ class Listener(Node):
         if not message.hands:
             print('no hand', flush=True)
         for hand in message.hands:
-            tip = hand.joints[INDEX_TIP]  # metres, in the frame message.header.frame_id: x right, y down, z forward
+            index_tip = get_skeleton(message.skeleton).joint_names.index('index_tip')  # models differ in their joints
+            tip = hand.joints[index_tip]  # metres, in the frame message.header.frame_id: x right, y down, z forward
             print(f'{hand.id} {SIDES[hand.side]:<7} index tip at {tip.x:+.3f} {tip.y:+.3f} {tip.z:.3f} m, '
-                  f'confidence {hand.confidence[INDEX_TIP]:.2f}', flush=True)
+                  f'confidence {hand.confidence[index_tip]:.2f}', flush=True)
 
 
 def main() -> None:
@@ -42,6 +45,8 @@ def main() -> None:
         rclpy.spin(Listener())
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
+    except HandPoseError as error:
+        sys.exit(f'hand/joints: {error}')
     finally:
         rclpy.try_shutdown()
 

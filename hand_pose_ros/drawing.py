@@ -35,15 +35,17 @@ def shade(depth: NDArray[np.float32], intrinsics: Intrinsics, near: float | None
     """A depth image (H, W) in metres as a lit surface, so that fingers can be told apart; no reading is dark.
 
     Args:
+        depth: what is not finite counts as no reading, as 0 does.
         near, far: metres over which the tint goes from bright to dark; by default the range of the image.
     """
-    valid = depth > 0
+    valid = (depth > 0) & np.isfinite(depth)
     if not valid.any():
         return np.full((*depth.shape, 3), _NOTHING, np.uint8)
     z = depth[valid]
     near = float(np.percentile(z, 1)) if near is None else near
     far = float(np.percentile(z, 95)) if far is None else far
-    smooth = cv2.bilateralFilter(depth, 7, 0.015, 2.0)  # sensor noise would drown the shading
+    # Sensor noise would drown the shading, and what is not finite would smear.
+    smooth = cv2.bilateralFilter(np.where(valid, depth, np.float32(0)), 7, 0.015, 2.0)
     distance = np.where(valid, smooth, 1)
     slope_x = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8) * (intrinsics.fx / distance)
     slope_y = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1 / 8) * (intrinsics.fy / distance)
@@ -85,7 +87,7 @@ def overlay(depth: NDArray[np.float32], intrinsics: Intrinsics, hands: Sequence[
     """The whole image with its hands, and beside it each hand alone, close up.
 
     Args:
-        depth: (H, W) metres, 0 = no reading.
+        depth: (H, W) metres; 0, NaN and infinite = no reading.
         height: of the picture, pixels.
     """
     scale = height / depth.shape[0]

@@ -18,7 +18,7 @@ def generate_launch_description() -> LaunchDescription:
         'depth_topic': ('depth/image_rect', 'Depth image, without its transport; camera_info is beside it.'),
         'params_file': (str(SHARE / 'config' / 'estimator.yaml'), 'Parameters of the node.'),
         'namespace': ('', 'Namespace of the node and its topics.'),
-        'use_sim_time': ('false', 'Take the time from /clock (bags played with --clock).'),
+        'use_sim_time': ('false', 'Take the time from /clock (bags played with --clock); params_file is not asked.'),
         'rviz': ('false', 'Show the hands in RViz.'),
     }
     return LaunchDescription([

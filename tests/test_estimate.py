@@ -287,6 +287,15 @@ def test_nothing_is_dark_and_near_is_brighter_than_far():
     assert shade(np.zeros((4, 4), np.float32), camera).max() < 40
 
 
+def test_what_is_not_finite_is_drawn_as_no_reading(drawn):
+    depth, camera, hand = drawn
+    broken = depth.copy()
+    broken[100:110, 150:160], broken[:, :20] = np.nan, np.inf
+    depth[100:110, 150:160] = 0
+    np.testing.assert_array_equal(shade(broken, camera), shade(depth, camera))
+    np.testing.assert_array_equal(overlay(broken, camera, [hand]), overlay(depth, camera, [hand]))
+
+
 def test_a_contact_sheet_is_read_like_text():
     sheet = contact_sheet([np.full((2, 3, 3), value, np.uint8) for value in (50, 100, 150)], columns=2)
     assert sheet.shape == (4, 6, 3)

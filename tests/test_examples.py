@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -105,13 +106,15 @@ def test_bag_without_ros(run: Callable[..., str], film: Film) -> None:
 
 
 @pytest.mark.parametrize('command', [
-    'depth_png.py missing.png --intrinsics 140 140 80 60', 'bag_without_ros.py missing.mcap',
+    'depth_png.py missing.png --intrinsics 140 140 80 60',
+    f'depth_png.py {CHECKOUT}/demo/depth.png --intrinsics 364.5 364.5 256 208 --picture missing',
+    'bag_without_ros.py missing.mcap',
     'train_on_your_bags.py --train missing.mcap --val missing.mcap --out mine'])
 def test_bad_input_is_one_sentence(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     name, *arguments = command.split()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, 'argv', [name, *arguments])
-    with pytest.raises(SystemExit, match=r'missing\.\w+: '):
+    with pytest.raises(SystemExit, match=r'missing(\.\w+)?: '):
         runpy.run_path(str(EXAMPLES / name), run_name='__main__')
 
 
@@ -139,13 +142,13 @@ def running(name: str, *arguments: str, said: Path) -> Iterator[None]:
         process.kill()
 
 
-def hands_message(joints: np.ndarray, score: float = 0.9) -> Any:
+def hands_message(joints: np.ndarray, score: float = 0.9, skeleton: str = 'hand21') -> Any:
     from geometry_msgs.msg import Point
 
     from hand_pose_ros.msg import HandJoints, HandJointsArray
     hand = HandJoints(id='hand_1', side=HandJoints.RIGHT, score=score, confidence=[0.75] * len(joints),
                       joints=[Point(x=x, y=y, z=z) for x, y, z in joints.tolist()])
-    return HandJointsArray(skeleton='hand21', hands=[hand])
+    return HandJointsArray(skeleton=skeleton, hands=[hand])
 
 
 @contextmanager
@@ -192,6 +195,9 @@ def test_subscribe(ros_domain: int, tmp_path: Path) -> None:
         wanted = 'hand_1 right   index tip at +0.100 -0.200 0.600 m, confidence 0.75'
         until(hands_message(joints), lambda: wanted in said.read_text())
         until(nobody, lambda: 'no hand' in said.read_text())
+        wanted = 'index tip at +6.000 +0.000 1.000 m'  # the seventh joint of nyu14
+        until(hands_message(np.array([[i, 0, 1] for i in range(14)], float), skeleton='nyu14'),
+              lambda: wanted in said.read_text())
 
 
 def test_gripper(ros_domain: int, tmp_path: Path) -> None:
@@ -209,3 +215,36 @@ def test_gripper(ros_domain: int, tmp_path: Path) -> None:
         later = time.monotonic() + 0.5
         until(hands_message(pose(), score=0.2), lambda: time.monotonic() > later)
         assert opening[-1] < 0.005, 'a hand that cannot be trusted moves nothing'
+
+
+@pytest.fixture
+def gripper(ros_domain: int) -> Iterator[Any]:
+    """The node of gripper.py, open by 0.1 m and in simulated time; its commands are in `openings`."""
+    rclpy = pytest.importorskip('rclpy', reason='needs ROS 2')
+    pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
+    rclpy.init(args=['--ros-args', '-p', 'max_opening:=0.1', '-p', 'use_sim_time:=true'])
+    node = runpy.run_path(str(EXAMPLES / 'gripper.py'))['Gripper']()
+    node.openings = []
+    node.commands = SimpleNamespace(publish=lambda command: node.openings.extend(command.data))
+    yield node
+    node.destroy_node()
+    rclpy.shutdown()
+
+
+def test_gripper_keeps_its_speed_from_the_first_command_on_and_when_the_clock_steps_back(gripper: Any) -> None:
+    from rclpy.clock import ClockType
+    from rclpy.time import Time
+    fist = hands_message(pose(mcp_flexion=80, pip_flexion=95, dip_flexion=55))
+    for seconds in (100.0, 100.1, 1.0, 1.1):  # a bag that begins again
+        gripper.get_clock().set_ros_time_override(Time(seconds=seconds, clock_type=ClockType.ROS_TIME))
+        gripper.on_hands(fist)
+    np.testing.assert_allclose(gripper.openings, [0.08, 0.06, 0.06, 0.04], atol=1e-6)
+
+
+def test_gripper_says_once_that_it_needs_the_joints_of_hand21(gripper: Any, capfd: pytest.CaptureFixture[str]) -> None:
+    for _ in range(2):
+        gripper.on_hands(hands_message(pose(), skeleton='msra21'))
+    gripper.on_hands(hands_message(pose()[:14], skeleton='nyu14'))
+    assert not gripper.openings
+    said = capfd.readouterr().err
+    assert said.count('hand21') == 1 and "'msra21': start the node with a model of hand21" in said

@@ -19,7 +19,7 @@ from hand_pose_ros.bags import Bag, BagWriter  # noqa: E402
 from hand_pose_ros.cli import main  # noqa: E402
 from hand_pose_ros.depth import decode_image  # noqa: E402
 from hand_pose_ros.errors import InputError  # noqa: E402
-from hand_pose_ros.msg import HandSkeleton  # noqa: E402
+from hand_pose_ros.msg import HandJointsArray, HandSkeleton  # noqa: E402
 from hand_pose_ros.ros.replay import Replay  # noqa: E402
 from hand_pose_ros.skeleton import HAND21  # noqa: E402
 
@@ -124,6 +124,28 @@ def test_the_latched_skeleton_reaches_who_comes_later(bag, listener, play):
     listener.on('/hand/skeleton', HandSkeleton, LATCHED)
     assert listener.until(lambda: listener.heard['/hand/skeleton'])
     assert tuple(listener.heard['/hand/skeleton'][0].joint_names) == HAND21.joint_names
+
+
+def test_what_was_latched_before_the_start_reaches_everybody(listener, play, tmp_path):
+    path = tmp_path / 'latched.mcap'
+    with BagWriter(path) as writer:
+        for i in range(30):
+            writer.write_skeleton(STAMPS[0] + i, f'frame_{i}', HAND21, 'a network', '1')
+        for stamp in STAMPS:
+            writer.write_hands(stamp, 'camera', [])
+    everything = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    listener.on('/hand/skeleton', HandSkeleton, everything).on('/hand/joints', HandJointsArray)
+    replay = play(path)
+    replay.wait_for_subscribers(10, number=2)
+    replay.play(start_s=0.264)
+    early, hands = listener.heard['/hand/skeleton'], listener.heard['/hand/joints']
+    assert listener.until(lambda: len(early) == 30 and len(hands) == 4)
+    assert stamps(hands) == STAMPS[8:]
+    listener.on('/hand/skeleton', HandSkeleton, everything)
+    late = listener.heard['/hand/skeleton']
+    assert listener.until(lambda: len(late) == 30)
+    for heard in (early, late):
+        assert [message.header.frame_id for message in heard] == [f'frame_{i}' for i in range(30)]
 
 
 def test_start_rate_and_topics(bag, listener, play):

@@ -5,7 +5,8 @@ from __future__ import annotations
 import importlib
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from itertools import chain
 from os import PathLike
 from typing import Any
 
@@ -30,6 +31,8 @@ from hand_pose_ros.ros import qos
 CLOCK_PERIOD_S = 0.025
 SETTLE_S = 0.5
 PATIENCE_S = 3.0
+MAX_LATCHED = 1000
+"""Of the messages of a latched topic, at most this many are kept for who comes later."""
 _RENAMED = {'tf/msg/tfMessage': 'tf2_msgs/msg/TFMessage'}  # on the way from ROS 1 to ROS 2
 
 
@@ -90,7 +93,7 @@ class Replay:
                 number, end = None, min(end, time.monotonic() + SETTLE_S)
 
     def play(self, start_s: float = 0.0, ready: Callable[[], bool] | None = None) -> None:
-        """Publish the bag once, from `start_s` seconds after its beginning.
+        """Publish the bag once, from `start_s` seconds after its beginning; what was latched before comes first.
 
         Args:
             ready: a message that is due waits until this is true; after PATIENCE_S in vain it is not asked again.
@@ -98,19 +101,20 @@ class Replay:
         Raises:
             InputError: where the bag is damaged, after everything before the damage; or nothing was recorded so late.
         """
-        messages = self._bag.messages(self._connections, start=self._bag.start_ns + round(start_s * 1e9))
-        first_ns = -1
-        for connection, recorded_ns, data in messages:
+        start_ns = self._bag.start_ns + round(start_s * 1e9)
+        latched = list(self._latched_before(start_ns))  # now, for a bag is not read in two places at once
+        messages = self._bag.messages(self._connections, start=start_ns)
+        first = next(messages, None)
+        if first is None:
+            raise InputError(f'{self._bag.path}: nothing was recorded later than {start_s} s: give a smaller start')
+        first_ns, self._origin = first[1], time.monotonic()
+        for connection, recorded_ns, data in chain(latched, [first], messages):
             message = self._to_ros2(connection, data)
-            if first_ns < 0:
-                first_ns, self._origin = recorded_ns, time.monotonic()
-            self._wait_for(recorded_ns, first_ns)
+            self._wait_for(max(recorded_ns, first_ns), first_ns)
             if ready is not None and not self._hold(ready):
                 ready = None
             self._outputs[connection.topic].publish(message)
             self.published[connection.topic] += 1
-        if first_ns < 0:
-            raise InputError(f'{self._bag.path}: nothing was recorded later than {start_s} s: give a smaller start')
         for output in self._outputs.values():
             output.wait_for_all_acked(Duration(seconds=1))
         time.sleep(SETTLE_S)  # best effort is not acknowledged, and what is still on the way goes with its publisher
@@ -130,13 +134,25 @@ class Replay:
             if self._bag.is_ros1 and msgtype not in typestore().fielddefs:
                 raise ImportError(f'{msgtype} cannot be converted from ROS 1')
             if connection.topic not in self._outputs:
+                number = sum(other.msgcount for other in self._bag.connections if other.topic == connection.topic)
                 self._outputs[connection.topic] = self.node.create_publisher(
-                    cls, connection.topic, _quality(connection, reliability))
+                    cls, connection.topic, _quality(connection, reliability, number))
                 self.published[connection.topic] = 0
         except (ImportError, AttributeError, ValueError, InvalidTopicNameException) as error:
             self.node.get_logger().warning(f'{connection.topic} is left out: {error}')
             return
         self._connections.append(connection)
+
+    def _latched_before(self, end_ns: int) -> Iterator[tuple[Connection, int, bytes]]:
+        """Messages on latched topics, such as /tf_static, that whoever listened at this time would have had."""
+        latched = [connection for connection in self._connections if _is_latched(connection)]
+        if not latched or end_ns <= self._bag.start_ns:
+            return
+        with suppress(InputError):  # damage on the way does not concern what comes after it
+            for message in self._bag.messages(latched):
+                if message[1] >= end_ns:
+                    return
+                yield message
 
     def _to_ros2(self, connection: Connection, data: bytes) -> bytes:
         """The message as ROS 2 serializes it."""
@@ -208,19 +224,23 @@ def replaying(path: str | PathLike[str], ros_args: Sequence[str] = (), **options
         rclpy.try_shutdown()
 
 
-def _quality(connection: Connection, reliability: str) -> QoSProfile:
-    """What the publisher of a topic offers: as recorded, unless a reliability is asked for."""
-    ext: Any = connection.ext
-    profile = QoSProfile(depth=10, reliability=QoSReliabilityPolicy.RELIABLE)
+def _is_latched(connection: Connection) -> bool:
+    ext = connection.ext
     if isinstance(ext, ConnectionExtRosbag2):
-        recorded = ext.offered_qos_profiles
-        latched = any(offer.durability == QosDurability.TRANSIENT_LOCAL for offer in recorded)
-        if any(offer.reliability == QosReliability.BEST_EFFORT for offer in recorded):
-            profile.reliability = QoSReliabilityPolicy.BEST_EFFORT
-    else:
-        latched = bool(ext.latching)
-    if latched:
+        return any(offer.durability == QosDurability.TRANSIENT_LOCAL for offer in ext.offered_qos_profiles)
+    return bool(ext.latching)
+
+
+def _quality(connection: Connection, reliability: str, number: int) -> QoSProfile:
+    """What the publisher of a topic with so many messages offers: as recorded, unless a reliability is asked for."""
+    ext = connection.ext
+    profile = QoSProfile(depth=10, reliability=QoSReliabilityPolicy.RELIABLE)
+    if isinstance(ext, ConnectionExtRosbag2) and any(
+            offer.reliability == QosReliability.BEST_EFFORT for offer in ext.offered_qos_profiles):
+        profile.reliability = QoSReliabilityPolicy.BEST_EFFORT
+    if _is_latched(connection):
         profile.durability = QoSDurabilityPolicy.TRANSIENT_LOCAL
+        profile.depth = min(max(profile.depth, number), MAX_LATCHED)
     if reliability != 'recorded':
         profile.reliability = getattr(QoSReliabilityPolicy, reliability.upper())
     return profile

@@ -36,7 +36,7 @@ class CudaEngine(Engine):
 
     def __init__(self, pipeline: Pipeline, device: str = 'cuda') -> None:
         self.outputs, self.device = pipeline.outputs, torch.device(device)
-        fuse(pipeline.network)  # without their norms some layers give more than a half can hold
+        fuse(pipeline.network)
         pipeline.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.pipeline = pipeline.to(self.device).half()
         self.stream = torch.cuda.Stream(self.device)

@@ -28,11 +28,12 @@ class Pipeline(nn.Module):
     def half(self) -> Pipeline:
         """In half precision, where that moves no joint by half a millimetre.
 
-        Nothing is with a refiner, to which it matters much where it is told that a joint is; nor is a first look, as
+        Nothing is with a refiner, to which it matters much where it is told that a joint is; nor where norms are no
+        part of the weights (`fused.fuse`), as a layer before one may give more than a half can hold. A first look is not, as
         the view of the second is rounded and must not depend on it; nor the stem of a dense network, whose weights,
         rounded, move joints by more than all others together.
         """
-        if self.refiner is not None:
+        if self.refiner is not None or any(isinstance(module, nn.BatchNorm2d) for module in self.modules()):
             return self
         dense = [each for each in self.modules() if isinstance(each, HandDense)]
         exact = [*(each.stem for each in dense), getattr(self.network, 'first', None)]

@@ -29,9 +29,9 @@ class Pipeline(nn.Module):
         """In half precision, where that moves no joint by half a millimetre.
 
         Nothing is with a refiner, to which it matters much where it is told that a joint is; nor where norms are no
-        part of the weights (`fused.fuse`), as a layer before one may give more than a half can hold. A first look is not, as
-        the view of the second is rounded and must not depend on it; nor the stem of a dense network, whose weights,
-        rounded, move joints by more than all others together.
+        part of the weights (`fused.fuse`), as a layer before one may give more than a half can hold. A first look is
+        not, as the view of the second is rounded and must not depend on it; nor the stem of a dense network, whose
+        weights, rounded, move joints by more than all others together.
         """
         if self.refiner is not None or any(isinstance(module, nn.BatchNorm2d) for module in self.modules()):
             return self

@@ -16,9 +16,10 @@ import torch
 from hand_pose_ros.datasets import open_dataset
 from hand_pose_ros.datasets.memory import keep_freed_memory
 from hand_pose_ros.models import build
+from hand_pose_ros.runtime.cuda_engine import WARM_UP
 from hand_pose_ros.skeleton import HAND21
 from hand_pose_ros.training.augmentation import PRESETS, augment
-from hand_pose_ros.training.gradients import WARM_UP, Gradients
+from hand_pose_ros.training.gradients import Gradients
 from hand_pose_ros.training.objectives import objective_for
 from hand_pose_ros.training.optimizers import make_optimizer
 from hand_pose_ros.training.recipes import get_recipe

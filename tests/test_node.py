@@ -558,6 +558,9 @@ def test_an_empty_room_is_no_wrong_depth_scale_once_a_hand_was_seen(rig: Rig) ->
     rig.answer(publish, image(np.zeros((HEIGHT, WIDTH))))
     rig.until_said('no reading')  # which was said after all that there was to say before
     assert not any('depth_scale' in text for text in rig.said())
+    assert rig.set_parameter('depth_scale', 0.0011)[0]  # of which nothing is known yet
+    rig.answer(publish, image(np.full((HEIGHT, WIDTH), 3.0)))
+    rig.until_said('check depth_scale')
 
 
 def test_silence_names_the_topic_and_its_publishers(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -106,7 +106,7 @@ class EstimatorNode(LifecycleNode):
         self._image_topic, info_topic = topics.input_topics(self, self._params.transport)
         self._camera = Camera(info_topic)
         self._regions: list[Region] = []
-        self._scale_is_right = False
+        self._right_scale = 0.0  # depth_scale at which a hand was seen
         self._estimator = estimator
         return super().on_configure(state)
 
@@ -310,9 +310,10 @@ class EstimatorNode(LifecycleNode):
             self._complain(f'{self._image_topic}: {problem}')
         hands = estimator(depth, intrinsics, time_s=stamp_ns(header) / 1e9 or None, regions=regions)
         self._statistics.time(**estimator.timings)
-        self._scale_is_right |= bool(hands)
+        if hands:
+            self._right_scale = params.depth_scale
         problem = topics.NO_REGION if regions == [] else depth_problem(
-            depth, params.min_depth, params.max_depth, self._scale_is_right)
+            depth, params.min_depth, params.max_depth, params.depth_scale == self._right_scale)
         if not hands and problem:
             self._complain(f'{self._image_topic}: {problem}')
         return hands

@@ -10,19 +10,16 @@ import torch
 from torch import Tensor, nn
 
 from hand_pose_ros.datasets import Batch
+from hand_pose_ros.runtime.cuda_engine import WARM_UP
 from hand_pose_ros.training.losses import Terms
-
-WARM_UP = 3
-"""Batches before the capture: libraries choose algorithms and allocate in the first ones, which a graph must not hold.
-"""
 
 
 class Gradients:
     """`gradients(batch)` returns the terms of the loss; of their sum the parameters hold the gradients afterwards.
 
     Launching the thousand small kernels of a step takes a processor longer than a GPU needs for them. There they are
-    launched as one, a CUDA graph of the fourth batch, which later ones run through; so all are of the same shapes, and
-    nothing in the module may wait for the GPU or copy something there.
+    launched as one, a CUDA graph, captured after a few batches, which later ones run through; so all are of the same
+    shapes, and nothing in the module may wait for the GPU or copy something there.
 
     Args:
         module: from a batch to the terms.
@@ -33,15 +30,15 @@ class Gradients:
     def __init__(self, module: nn.Module, precision: Callable[[], AbstractContextManager[Any]], captured: bool) -> None:
         self._module, self._precision = module, precision
         self._parameters = [parameter for parameter in module.parameters() if parameter.requires_grad]
-        self._warm_up = WARM_UP if captured else -1
+        self._captured, self._calls = captured, 0
         self._graph: torch.cuda.CUDAGraph | None = None
         self._inputs: Batch = {}
         self._terms: Terms = {}
         self._gradients: list[Tensor | None] = []
 
     def __call__(self, batch: Batch) -> Terms:
-        if self._warm_up:
-            self._warm_up -= 1
+        self._calls += 1
+        if not self._captured or self._calls <= WARM_UP:
             return self._compute(batch)
         if self._graph is None:
             self._graph = self._capture(batch)

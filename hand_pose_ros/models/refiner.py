@@ -66,16 +66,18 @@ class Refiner(nn.Module):
             nn.init.normal_(weight, std=(2 / weight.shape[1]) ** 0.5)
         nn.init.normal_(last, std=0.001)  # so that an untrained refiner moves nothing
         self.dropout = nn.Dropout(dropout)
+        self.cut = cut  # an engine may have a faster one
 
     def forward(self, patch: Tensor, joints: Tensor, iterations: int = 2) -> Tensor:
         """Patch (B, 1, 128, 128) and estimates (B, J, 3) in cube units -> better estimates (B, J, 3).
 
         The gradient reaches the weights through the last iteration only: where to look is taken as given.
         """
-        images = [_marked(patch, view) for view in self.views]
+        marked = torch.where(patch < 1, patch, torch.full_like(patch, FAR))
+        images = [_framed(marked, view) for view in self.views]
         for _ in range(iterations):
             joints = joints.detach()
-            joints = joints + self.offsets([_cut(image, joints, view) for image, view in
+            joints = joints + self.offsets([self.cut(image, joints, view) for image, view in
                                             zip(images, self.views, strict=True)])
         return joints
 
@@ -142,16 +144,15 @@ def _reach(view: View) -> float:
     return view.width / PATCH_SIZE
 
 
-def _marked(patch: Tensor, view: View) -> Tensor:
-    """(B, 1, 128, 128) -> (B, W, W), pooled for a view, with the background, there and around it, at FAR."""
-    marked = torch.where(patch < 1, patch, torch.full_like(patch, FAR))
+def _framed(marked: Tensor, view: View) -> Tensor:
+    """(B, 1, 128, 128) -> (B, W, W): pooled for a view, with background around it."""
     if view.shrink > 1:
         marked = -F.max_pool2d(-marked, view.shrink)
     border = view.width // view.shrink
     return F.pad(marked[:, 0], (border, border + 1) * 2, value=FAR)
 
 
-def _cut(image: Tensor, joints: Tensor, view: View) -> Tensor:
+def cut(image: Tensor, joints: Tensor, view: View) -> Tensor:
     """The cubes of a view around the joints (B, J, 3), as (B, J, N, N) in [-1, 1] like a patch.
 
     Depth is taken relative to the joint and clipped to the cube, and then shifted by the fraction of a pixel

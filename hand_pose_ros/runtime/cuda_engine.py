@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
+from types import ModuleType
 
 import numpy as np
 import torch
@@ -14,6 +16,8 @@ from hand_pose_ros.runtime.fused import fuse
 
 WARM_UP = 3
 """Runs before the capture: libraries choose algorithms and allocate in the first ones, which a graph must not hold."""
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -36,7 +40,7 @@ class CudaEngine(Engine):
 
     def __init__(self, pipeline: Pipeline, device: str = 'cuda') -> None:
         self.outputs, self.device = pipeline.outputs, torch.device(device)
-        fuse(pipeline.network)
+        fuse(pipeline, _own_kernels(self.device))
         pipeline.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.pipeline = pipeline.to(self.device).half()
         self.stream = torch.cuda.Stream(self.device)
@@ -77,3 +81,17 @@ class CudaEngine(Engine):
 
     def _compute(self, source: Tensor) -> tuple[Tensor, ...]:
         return self.pipeline(source.to(self.device, non_blocking=True))
+
+
+def _own_kernels(device: torch.device) -> ModuleType | None:
+    """`runtime.kernels`, where Triton (which PyTorch for CUDA brings along on Linux) can compile them."""
+    try:
+        from hand_pose_ros.runtime import kernels
+        with torch.cuda.device(device):
+            one = torch.ones(1, 1, device=device)
+            kernels.linear(one, one, one[0], relu=False).cpu()
+    except Exception as error:  # no Triton, no C compiler, a GPU too old: each has an error of its own
+        _log.warning('a hand takes longer than it could, as kernels cannot be compiled here: %s',
+                     (str(error) or type(error).__name__).splitlines()[0])
+        return None
+    return kernels

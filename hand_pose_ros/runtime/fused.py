@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import ModuleType
 from typing import Any
 
 import torch
@@ -10,17 +11,25 @@ from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from hand_pose_ros.models.dense import Residual
+from hand_pose_ros.models.refiner import Refiner
 
 
 class ConvolutionReLU(nn.Module):
-    """A convolution, what is to be added to it, and ReLU."""
+    """A convolution, what is to be added to it, max-pooling, and ReLU."""
 
-    def __init__(self, convolution: nn.Conv2d) -> None:
+    def __init__(self, convolution: nn.Conv2d, pool: int = 1, kernels: ModuleType | None = None) -> None:
         super().__init__()
-        self.convolution = convolution
-        self._one_kernel = True
+        self.convolution, self.pool = convolution, pool
+        self._kernels = kernels if kernels and kernels.fits(convolution, pool) else None
+        self._one_kernel = convolution.groups == 1
 
     def forward(self, x: Tensor, added: Tensor | None = None) -> Tensor:
+        if self._kernels and added is None and len(x) <= self._kernels.HANDS:
+            return self._kernels.convolve(x, self.convolution, self.pool)
+        y = self._convolved(x, added)
+        return F.max_pool2d(y, self.pool) if self.pool > 1 else y  # behind ReLU it gives the same
+
+    def _convolved(self, x: Tensor, added: Tensor | None) -> Tensor:
         layer = self.convolution
         if x.is_cuda and self._one_kernel:
             sizes: list[Any] = [layer.stride, layer.padding, layer.dilation, layer.groups]
@@ -47,21 +56,55 @@ class FusedResidual(nn.Module):
         return self.last(self.first(x), self.shortcut(x))
 
 
-def fuse(module: nn.Module) -> None:
-    """Replace what can be fused of a network that does not train."""
+class LinearReLU(nn.Linear):
+    """A linear layer, with ReLU or without, computed by `kernels` for few hands."""
+
+    def __init__(self, layer: nn.Linear, relu: bool, kernels: ModuleType) -> None:
+        super().__init__(layer.in_features, layer.out_features, device='meta')
+        self.weight, self.bias, self.relu, self._kernels = layer.weight, layer.bias, relu, kernels
+
+    def forward(self, x: Tensor) -> Tensor:
+        if len(x) <= self._kernels.HANDS:
+            return self._kernels.linear(x, self.weight, self.bias, self.relu)
+        y = super().forward(x)
+        return F.relu(y) if self.relu else y
+
+
+def fuse(module: nn.Module, kernels: ModuleType | None = None) -> None:
+    """Replace what can be fused of a network that does not train.
+
+    Args:
+        kernels: `runtime.kernels`, if it can be used.
+    """
+    if isinstance(module, nn.Sequential):
+        _fuse_neighbours(module, kernels)
     for name, child in module.named_children():
         if isinstance(child, Residual):
             setattr(module, name, FusedResidual(child))
+        elif kernels and type(child) is nn.Linear:
+            setattr(module, name, LinearReLU(child, relu=False, kernels=kernels))
         else:
-            fuse(child)
-    if not isinstance(module, nn.Sequential):
-        return
-    for i, layer in enumerate(module):
-        behind = i + 1
-        if behind < len(module) and isinstance(module[behind], nn.MaxPool2d):
-            behind += 1  # ReLU before it gives the same
-        if _is_convolution(layer) and behind < len(module) and isinstance(module[behind], nn.ReLU):
-            module[i], module[behind] = ConvolutionReLU(_plain(layer)), nn.Identity()
+            fuse(child, kernels)
+    if kernels and isinstance(module, Refiner):
+        module.cut = kernels.cut
+
+
+def _fuse_neighbours(layers: nn.Sequential, kernels: ModuleType | None) -> None:
+    """Convolution, pooling and ReLU; and linear layer and ReLU."""
+    for i, layer in enumerate(layers):
+        behind, pool = i + 1, 1
+        if behind < len(layers) and isinstance(pooling := layers[behind], nn.MaxPool2d):
+            behind, pool = behind + 1, int(pooling.kernel_size)  # type: ignore[arg-type]  # squares, all of them
+        if behind == len(layers) or not isinstance(layers[behind], nn.ReLU):
+            continue
+        if _is_convolution(layer):
+            layers[i] = ConvolutionReLU(_plain(layer), pool, kernels)
+        elif kernels and type(layer) is nn.Linear:
+            layers[i] = LinearReLU(layer, relu=True, kernels=kernels)
+        else:
+            continue
+        for j in range(i + 1, behind + 1):
+            layers[j] = nn.Identity()
 
 
 def _is_convolution(layer: nn.Module) -> bool:

@@ -107,7 +107,7 @@ def candidates(depth: NDArray[np.float32], intrinsics: Intrinsics, *, side: floa
             center = _settle(scene, unseen, scene.centroid(z, piece, slice(None), slice(None)), side)
             again = any(np.linalg.norm(center - cube.center) < side / 3 for cube in found)
             if not again and _may_hold_a_hand(scene, center, side, MAX_THROUGH):
-                found.append(Cube((float(center[0]), float(center[1]), float(center[2])), side))
+                found.append(Cube.at(center, side))
                 yield found[-1]
             # Whatever it was, it has been judged: look behind and beside it.
             _, inside, rows, cols = scene.inside(center, side)

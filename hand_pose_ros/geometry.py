@@ -110,6 +110,12 @@ class Cube:
         if not (np.isfinite(self.center).all() and self.center[2] > 0 and self.side > 0):
             raise InputError(f'a cube with centre {self.center} and side {self.side} is not in front of the camera')
 
+    @classmethod
+    def at(cls, center: ArrayLike, side: float) -> Cube:
+        """The cube around a point (3,), in metres."""
+        x, y, z = np.asarray(center, np.float64).tolist()
+        return cls((x, y, z), side)
+
     def to_cube(self, points: ArrayLike) -> NDArray[np.float64]:
         """Points (..., 3) in metres -> cube units (..., 3)."""
         points = np.asarray(points, np.float64)

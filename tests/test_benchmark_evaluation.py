@@ -9,6 +9,7 @@ from hand_pose_ros.evaluation.benchmark_evaluation import _self_knowledge, evalu
 from hand_pose_ros.models import build
 from hand_pose_ros.models.checkpoints import save_checkpoint
 from hand_pose_ros.synthetic import benchmark
+from hand_pose_ros.synthetic.generator import LEFT
 
 
 def test_a_network_is_scored_on_the_frames_with_a_hand(tmp_path):
@@ -30,6 +31,19 @@ def test_a_network_is_scored_on_the_frames_with_a_hand(tmp_path):
     assert [row['visible'] for row in rows] == [[0, 7], [8, 14], [15, 21]]
     assert sum(row['frames'] for row in rows) == present
     assert sum(row['frames'] * row['mean_mm'] for row in rows) / present == pytest.approx(summary['mean_mm'], abs=0.01)
+
+
+def test_errors_are_those_of_the_scene_also_of_left_hands(tmp_path):
+    torch.manual_seed(0)
+    weights = tmp_path / 'net.safetensors'
+    save_checkpoint(weights, build('hand_dense', width=4), {'skeleton': 'hand21', 'cube_side': 0.3})
+    result = evaluate_benchmark(str(weights), device='cpu', frames=50)
+    scene = next(iter(benchmark.frames(50, batch=50)))
+    present, left = scene['hand_present'], scene['side'] == LEFT
+    assert (left & present).any() and (~left & present).any()
+    expected = scene['joints_m'].clone()
+    expected[left, :, 0] *= -1
+    np.testing.assert_allclose(result.truth, expected[present], atol=1e-6)
 
 
 def test_calibration_counts_what_was_right():

@@ -14,7 +14,7 @@ from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.files import check_writable
 
 if TYPE_CHECKING:
-    from hand_pose_ros.evaluation.bag_evaluation import Progress
+    from hand_pose_ros.evaluation.progress import Progress
     from hand_pose_ros.models.checkpoints import Checkpoint
     from hand_pose_ros.runtime import Engine
     from hand_pose_ros.training.adapt import Look, Numbers

@@ -97,13 +97,18 @@ class RecordedDataset(Dataset):
 
     @staticmethod
     def _sample(frame: LabelledFrame) -> tuple[NDArray[np.float32], NDArray[np.float64], tuple[float, ...], float]:
-        seed = Cube((float(frame.seed[0]), float(frame.seed[1]), float(frame.seed[2])), frame.cube_side)
-        cube = center_of_mass_cube(frame.depth, seed, frame.intrinsics)
+        cube = center_of_mass_cube(frame.depth, Cube.at(frame.seed, frame.cube_side), frame.intrinsics)
         patch, joints, center = crop(frame.depth, cube, frame.intrinsics), cube.to_cube(frame.joints), cube.center
         if frame.left:
-            patch, joints = patch[..., ::-1], joints * (-1, 1, 1)
-            center = (-center[0], center[1], center[2])
+            patch, joints, center = mirrored(patch, joints, center)
         return patch, joints, center, cube.side
+
+
+def mirrored(patch: NDArray[Any], joints: NDArray[Any], center: tuple[float, float, float],
+             ) -> tuple[NDArray[Any], NDArray[Any], tuple[float, float, float]]:
+    """Patch (..., 128), joints (..., 3) and the centre of their cube, as those of a hand of the other side."""
+    x, y, z = center
+    return patch[..., ::-1], joints * (-1, 1, 1), (-x, y, z)
 
 
 def center_of_mass_cube(depth: NDArray[np.float32], seed: Cube, intrinsics: Intrinsics) -> Cube:
@@ -119,7 +124,7 @@ def center_of_mass_cube(depth: NDArray[np.float32], seed: Cube, intrinsics: Intr
     if not len(rows):
         return seed
     center = intrinsics.back_project((columns.mean() + left, rows.mean() + top), window[rows, columns].mean())
-    return Cube((float(center[0]), float(center[1]), float(center[2])), seed.side)
+    return Cube.at(center, seed.side)
 
 
 def joints_in_metres(joints: Tensor, cube_center: Tensor, cube_side: Tensor) -> Tensor:

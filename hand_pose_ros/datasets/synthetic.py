@@ -14,12 +14,12 @@ from hand_pose_ros.datasets.base import Batch, Dataset, DatasetError
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.models.finder import FOCAL
 from hand_pose_ros.skeleton import HAND21
+from hand_pose_ros.synthetic.benchmark import SENSORS
+from hand_pose_ros.synthetic.generator import LEFT, SyntheticHands
 from hand_pose_ros.synthetic.stages import Ingredients
 
 INGREDIENTS = tuple(field.name for field in dataclasses.fields(Ingredients))
 """What a variant can do without."""
-LEFT = 1
-"""`side` of a left hand, as in the message HandJoints."""
 
 
 class Synthetic(Dataset):
@@ -40,8 +40,6 @@ class Synthetic(Dataset):
     size = None
 
     def __init__(self, split: str, device: str = 'cpu', variant: str = '') -> None:
-        from hand_pose_ros.synthetic.benchmark import SENSORS
-        from hand_pose_ros.synthetic.generator import SyntheticHands
         ingredients = _ingredients(variant)
         if split != 'train':
             variant, ingredients = '', None
@@ -58,11 +56,14 @@ class Synthetic(Dataset):
 
     def batch(self, indices: Tensor) -> Batch:
         hands = self._hands.batch(indices.to(self.device))
-        # The patch of a left hand comes mirrored; the centre of its cube must follow.
-        mirror = torch.where(hands['side'] == LEFT, -1.0, 1.0).to(self.device)
-        center = hands['cube_center'] * torch.stack([mirror, torch.ones_like(mirror), torch.ones_like(mirror)], dim=-1)
-        return {'patch': hands['patch'], 'joints': hands['joints'], 'cube_center': center,
+        return {'patch': hands['patch'], 'joints': hands['joints'], 'cube_center': seen_centers(hands),
                 'cube_side': hands['cube_side'], 'hand_present': hands['hand_present']}
+
+
+def seen_centers(hands: Batch) -> Tensor:
+    """Centres (B, 3) of the cubes of `SyntheticHands.batch`, mirrored where the patch and its joints are."""
+    x, y, z = hands['cube_center'].unbind(-1)
+    return torch.stack([torch.where(hands['side'] == LEFT, -x, x), y, z], dim=-1)
 
 
 class SyntheticScenes(Dataset):
@@ -81,7 +82,6 @@ class SyntheticScenes(Dataset):
     size = None
 
     def __init__(self, split: str, device: str = 'cpu') -> None:
-        from hand_pose_ros.synthetic.generator import SyntheticHands
         self.name = f'scenes-{split}'
         self.device = torch.device(device)
         try:

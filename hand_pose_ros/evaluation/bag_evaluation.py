@@ -22,6 +22,7 @@ from hand_pose_ros.bags import DepthBag, Frame
 from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.estimator import HandEstimate, HandPoseEstimator
 from hand_pose_ros.evaluation.ground_truth import read_truth, with_truth
+from hand_pose_ros.evaluation.progress import Progress, silent
 from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.models.checkpoints import DEFAULT
@@ -33,8 +34,6 @@ _R = TypeVar('_R')
 Outcome = Result | HandPoseError
 AHEAD = 2
 """So many images are decoded before their turn."""
-Progress = Callable[[Iterable[Any], int], Iterable[Any]]
-"""Passes items on and shows how far it is; the number is how many there will be."""
 
 
 class Sink(Protocol):
@@ -44,7 +43,6 @@ class Sink(Protocol):
 
 
 OpenSink = Callable[[Skeleton, Mapping[str, Any]], AbstractContextManager[Sink]]
-STAGES = ('read', 'decode', 'detect', 'crop', 'predict', 'uncrop')
 
 
 @dataclass(frozen=True)
@@ -67,7 +65,7 @@ class Settings:
     ground_truth: str | None = None
 
 
-def evaluate_bag(path: str | Path, settings: Settings, progress: Progress | None = None,
+def evaluate_bag(path: str | Path, settings: Settings, progress: Progress = silent,
                  open_sink: OpenSink | None = None) -> Result:
     """Estimate every depth image of a bag; on the CPU twice the same to the last bit.
 
@@ -94,8 +92,8 @@ def evaluate_bag(path: str | Path, settings: Settings, progress: Progress | None
         bag = stack.enter_context(DepthBag(path, **settings.bag))
         sink = stack.enter_context(open_sink(estimator.skeleton, estimator.metadata)) if open_sink else None
         images = starmap(_Image, _until_damaged(bag, notes))
-        done: Iterable[tuple[_Image, list[HandEstimate]]] = stack.enter_context(closing(_beside(record.add, images)))
-        for image, hands in progress(done, len(bag)) if progress else done:
+        done = stack.enter_context(closing(_in_background(record.add, images)))
+        for image, hands in progress(done, len(bag)):
             if sink:
                 sink.add(image.frame, hands)
         if record.intrinsics is None:
@@ -109,14 +107,14 @@ def evaluate_bag(path: str | Path, settings: Settings, progress: Progress | None
     result = Result(
         name=Path(path).stem, skeleton=estimator.skeleton, intrinsics=record.intrinsics,
         predictions=np.stack(record.joints), stamps_ns=np.array(record.stamps), notes=tuple(notes),
-        seconds={stage: np.array(record.seconds[stage]) for stage in sorted(record.seconds, key=_stage_order)},
+        seconds={stage: np.array(values) for stage, values in record.seconds.items()},
         info={'bag': str(path), 'depth_topic': bag.depth_topic, 'model': str(settings.model or DEFAULT),
               'engine': estimator.engine.name, 'frames_per_s': round(rate, 1), 'damaged': damaged})
     return with_truth(result, truth, record.frame_id) if truth else result
 
 
 def evaluate_bags(paths: Sequence[str | Path], settings: Settings, jobs: int | None = None,
-                  progress: Progress | None = None,
+                  progress: Progress = silent,
                   open_sinks: Mapping[str | Path, OpenSink] | None = None) -> Iterator[tuple[str | Path, Outcome]]:
     """Evaluate many bags at once; one that fails does not stop the others.
 
@@ -137,9 +135,7 @@ def evaluate_bags(paths: Sequence[str | Path], settings: Settings, jobs: int | N
     share = max(1, cores() // here)
     workers = max(1, min(jobs or share, len(mine)))
     settings = replace(settings, num_threads=settings.num_threads or max(1, share // workers))
-    finished: Iterable[tuple[str | Path, Outcome]] = _attempts(mine, settings, open_sinks or {}, workers)
-    if progress:
-        finished = progress(finished, len(mine))
+    finished = progress(_attempts(mine, settings, open_sinks or {}, workers), len(mine))
     yield from finished if world == 1 else _gather(dict(finished), rank, world).items()
 
 
@@ -194,7 +190,7 @@ class _Record:
             self.intrinsics = self.intrinsics or image.intrinsics
         except InputError as error:
             self.failures.append(f'image {len(self.stamps) + 1}: {error}')
-        for stage in times.keys() | self.seconds.keys():
+        for stage in {**self.seconds, **times}:  # in the order of the path
             self.seconds.setdefault(stage, [np.nan] * len(self.stamps)).append(times.get(stage, np.nan))
         self.stamps.append(image.frame.stamp_ns)
         self.frame_id = image.frame.frame_id
@@ -203,7 +199,7 @@ class _Record:
         return hands
 
 
-def _beside(work: Callable[[_T], _R], items: Iterable[_T]) -> Generator[tuple[_T, _R]]:
+def _in_background(work: Callable[[_T], _R], items: Iterable[_T]) -> Generator[tuple[_T, _R]]:
     """Each item and what becomes of it, in order; the work is done in a thread while the next items are made."""
     with ThreadPoolExecutor(1) as worker:
         pending: deque[tuple[_T, Future[_R]]] = deque()
@@ -277,8 +273,3 @@ def _gather(done: dict[str | Path, Outcome], rank: int, world: int) -> dict[str 
     finally:
         dist.destroy_process_group()
     return {path: result for share in everything or [] for path, result in share.items()}
-
-
-def _stage_order(stage: str) -> int:
-    """Stages in the order of the path, the total last."""
-    return STAGES.index(stage) if stage in STAGES else len(STAGES)

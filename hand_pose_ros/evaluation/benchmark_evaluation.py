@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hand_pose_ros.datasets import joints_in_metres
+from hand_pose_ros.datasets.synthetic import seen_centers
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.estimator import HandPoseEstimator
-from hand_pose_ros.evaluation.bag_evaluation import Progress
+from hand_pose_ros.evaluation.progress import Progress, silent
 from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.models.checkpoints import DEFAULT, load_checkpoint
@@ -27,7 +28,7 @@ THIRDS = 3
 
 
 def evaluate_benchmark(model: str | None = None, device: str = 'auto', frames: int = benchmark.FRAMES,
-                       progress: Progress = lambda items, total: items) -> Result:
+                       progress: Progress = silent) -> Result:
     """Joints of the frames of synthetic-test-v1 that show a hand; left hands are mirrored, so the side is given.
 
     `info` has the errors of joints that the camera sees and of those that it does not, and the errors of frames by how
@@ -52,8 +53,8 @@ def evaluate_benchmark(model: str | None = None, device: str = 'auto', frames: i
     for batch in progress(benchmark.frames(frames, batch=batch_size), -(-frames // batch_size)):
         answer = engine.run_full(batch['patch'].numpy())
         present = batch['hand_present'].numpy()
-        cube = batch['cube_center'], batch['cube_side']
         # Truth and estimate alike are those of the mirrored scene where the hand is a left one.
+        cube = seen_centers(batch), batch['cube_side']
         predicted = joints_in_metres(batch['joints'].new_tensor(answer['joints']), *cube).double().numpy()
         expected = joints_in_metres(batch['joints'], *cube).double().numpy()
         joints.append(predicted[present])
@@ -103,5 +104,3 @@ def _self_knowledge(confidence: NDArray[np.float32], right: NDArray[np.bool_], h
     return {'calibration_20_mm': calibration, 'side_found': share(side_found[present]),
             'hands_reported': share(score[present] >= HandPoseEstimator.min_score),
             'no_hands_reported': share(score[~present] >= HandPoseEstimator.min_score)}
-
-

@@ -11,14 +11,14 @@ from torch import Tensor
 from hand_pose_ros.datasets import joints_in_metres, open_dataset
 from hand_pose_ros.datasets.base import RecordedDataset
 from hand_pose_ros.errors import InputError
-from hand_pose_ros.evaluation.bag_evaluation import Progress
+from hand_pose_ros.evaluation.progress import Progress, silent
 from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.models.checkpoints import DEFAULT, load_checkpoint
 from hand_pose_ros.runtime import make_engine
 
 
 def evaluate_dataset(name: str, root: Path | None, model: str | None = None, split: str = 'test', device: str = 'auto',
-                     progress: Progress = lambda items, total: items) -> Result:
+                     progress: Progress = silent) -> Result:
     """Joints of all frames of a split. The crops follow the protocol of the original code: they start from the label.
 
     Args:

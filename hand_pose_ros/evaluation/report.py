@@ -110,7 +110,7 @@ def _cards(result: Result, read_depths: ReadDepths | None) -> list[_Card]:
         truth = result.truth[row] if result.truth is not None else np.full_like(estimate, np.nan)
         known = truth if np.isfinite(truth).all() else estimate
         center = np.nanmean(known, axis=0)
-        cube = Cube((float(center[0]), float(center[1]), float(center[2])), _VIEW_SIDE_M)
+        cube = Cube.at(center, _VIEW_SIDE_M)
         depth = depths.get(row)
         picture, kind = '', 'blind'
         if depth is not None:

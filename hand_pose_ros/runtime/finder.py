@@ -86,7 +86,7 @@ class Finder:
             wanted &= np.any([(u >= left) & (u < left + across) & (v >= top) & (v < top + down)
                               for left, top, across, down in regions] or [np.zeros(len(z), bool)], axis=0)
         order = [k for k in logits[ys, xs].argsort()[::-1] if wanted[k]][:MOST]
-        return [Cube((float(x[k] * z[k]), float(y[k] * z[k]), float(z[k])), side) for k in order]
+        return [Cube.at((x[k] * z[k], y[k] * z[k], z[k]), side) for k in order]
 
 
 def _scaled(principal: float, focal: float) -> float:

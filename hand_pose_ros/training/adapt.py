@@ -22,9 +22,11 @@ from torch import Tensor, nn
 
 from hand_pose_ros.bags import Frame
 from hand_pose_ros.datasets import Batch, joints_in_metres
+from hand_pose_ros.datasets.base import mirrored
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.estimator import HandEstimate
-from hand_pose_ros.evaluation.bag_evaluation import Progress, Settings, evaluate_bag
+from hand_pose_ros.evaluation.bag_evaluation import Settings, evaluate_bag
+from hand_pose_ros.evaluation.progress import Progress
 from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.geometry import crop
 from hand_pose_ros.runtime import Engine
@@ -110,7 +112,7 @@ class _Crops:
             patch, center = crop(image.depth, hand.cube, image.intrinsics), hand.cube.center
             joints = hand.cube.to_cube(hand.joints)
             if hand.side == 'left':
-                patch, joints, center = patch[..., ::-1], joints * (-1, 1, 1), (-center[0], *center[1:])
+                patch, joints, center = mirrored(patch, joints, center)
             self.samples.append((self._images, hand.side, patch.astype(np.float16), joints, center, hand.cube.side))
         self._images += 1
 

@@ -16,26 +16,23 @@ from typing import Any
 
 import torch
 import torch.distributed as dist
-from torch import Tensor, nn
+from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 from tqdm import tqdm
 
 from hand_pose_ros.datasets import Batch, open_dataset
 from hand_pose_ros.datasets.memory import keep_freed_memory
 from hand_pose_ros.datasets.shards import DiskShards, MemoryShards
-from hand_pose_ros.models import REFINERS, build
-from hand_pose_ros.models.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
-from hand_pose_ros.models.dense import ADDED, HandDense
-from hand_pose_ros.models.prior import fit_prior
-from hand_pose_ros.models.two_looks import TwoLooks
+from hand_pose_ros.models.checkpoints import load_checkpoint, save_checkpoint
 from hand_pose_ros.runtime import check_device
-from hand_pose_ros.training.augmentation import PRESETS, augment
+from hand_pose_ros.training.augmentation import augment
 from hand_pose_ros.training.folder import RunFolder, TrainingError
 from hand_pose_ros.training.gradients import Gradients
 from hand_pose_ros.training.losses import Terms
-from hand_pose_ros.training.objectives import PoseObjective, RefinerObjective, joints_count, objective_for
+from hand_pose_ros.training.objectives import RefinerObjective
 from hand_pose_ros.training.optimizers import learning_rate, make_optimizer
 from hand_pose_ros.training.recipes import EPOCH_OF_ENDLESS_DATA, Recipe, recipe_to_dict
+from hand_pose_ros.training.start import first_shard, make_objective
 from hand_pose_ros.training.state import load_state, save_state, save_tensors
 from hand_pose_ros.training.stream import SampleStream
 from hand_pose_ros.training.validation import estimate, first_samples
@@ -109,15 +106,16 @@ class Run:
         if recipe.last_shard is not None and self.shards.dataset.size is None:
             raise TrainingError(f'--set last_shard={recipe.last_shard} is for recorded datasets: {recipe.dataset} '
                                 'has no end; --set samples=N says how much of it is seen')
-        self.stream = SampleStream(self.shards, recipe.batch_size, recipe.seed, recipe.reuse,
-                                   self._first_shard(), recipe.last_shard, (self.rank, self.world))
+        first = first_shard(recipe, self.base, self.shards.dataset)
+        self.stream = SampleStream(self.shards, recipe.batch_size, recipe.seed, recipe.reuse, first, recipe.last_shard,
+                                   (self.rank, self.world))
         self.budget = recipe.samples or recipe.epochs * (self.stream.epoch_size or EPOCH_OF_ENDLESS_DATA)
         self.steps = -(-self.budget // recipe.batch_size)
 
         # Channels last is what fast convolutions of few channels want, and twice as fast for them on a CPU.
         with self._signals(), self._interruptible():
             try:
-                objective = self._make_objective().to(self.device)
+                objective = make_objective(recipe, self.base, self.shards, self.stream.first).to(self.device)
             except BaseException:
                 self.shards.close()
                 raise
@@ -131,104 +129,6 @@ class Run:
         self._result: dict[str, Any] = {}
         """Of the last validation."""
         self._saved = time.monotonic()
-
-    # What is trained, on what
-
-    def _first_shard(self) -> int:
-        """A refiner starts behind what its base was trained on."""
-        first, data = self.recipe.first_shard, self.shards.dataset
-        if self.recipe.refiner and self.base and self.base.metadata.get('training_data') == data.name:
-            size = self.base.metadata.get('recipe', {}).get('shard_size', self.recipe.shard_size)
-            seen = int(self.base.metadata['training_shards']) * size
-            first = max(first, -(-seen // self.recipe.shard_size))
-            if data.size is not None and first * self.recipe.shard_size >= data.size:
-                raise TrainingError(f'{self.recipe.base} was trained on all of {data.name}, so a refiner would learn '
-                                    'from estimates that are better than in use: train the base with --set '
-                                    'last_shard=N, which leaves the shards from N on to the refiner')
-        return first
-
-    def _make_objective(self) -> PoseObjective | RefinerObjective:
-        recipe, joints, base = self.recipe, len(self.skeleton), self.base
-        if recipe.refiner:
-            if base is None:
-                raise TrainingError('a refiner needs the checkpoint that it corrects: --set base=FILE')
-            if recipe.refiner not in REFINERS:
-                raise TrainingError(f'--set refiner={recipe.refiner}: choose one of {", ".join(REFINERS)}')
-            if base.metadata['skeleton'] != self.skeleton.name:
-                raise TrainingError(f'{recipe.base} gives joints of {base.metadata["skeleton"]}, but {recipe.dataset} '
-                                    f'has those of {self.skeleton.name}: a refiner needs a base of the same')
-            return RefinerObjective(build(recipe.refiner, joints=joints), base.network, recipe, self.skeleton)
-        if recipe.first and recipe.network != 'two_looks':
-            raise TrainingError(f'--set first=FILE is for --set network=two_looks, and {recipe.network} has one look')
-        of_joints = recipe.network not in ('center_refiner', 'hand_finder')
-        if (recipe.network == 'hand_finder') != (recipe.dataset == 'scenes'):
-            raise TrainingError(f'{recipe.network} cannot learn from {recipe.dataset}: hand_finder, and nothing else, '
-                                'is trained with dataset=scenes')
-        if recipe.network == 'hand_finder' and recipe.augmentation != PRESETS['none']:
-            raise TrainingError('hand_finder has its own augmentation: leave out --set augmentation')
-        given: dict[str, Any] = {'joints': joints} if of_joints else {}
-        first = None
-        if recipe.network == 'two_looks':
-            first = self._first_look(base)
-            given |= {'root': self.skeleton.root, 'knuckles': self.skeleton.knuckles,
-                      'first': {key: getattr(first, key) for key in ('width', 'bottleneck', 'blocks', 'refined')}}
-        if taken := sorted(given.keys() & recipe.options.keys()):
-            raise TrainingError(f'--set options.{taken[0]}: this follows from the dataset; leave it out')
-        network = build(recipe.network, **given, **recipe.options)
-        if first is not None:
-            network.first.load_state_dict(first.state_dict())  # type: ignore[union-attr]
-        objective = objective_for(network, recipe, self.skeleton)
-        bottleneck = recipe.options.get('bottleneck')
-        has_prior = base is not None and self._start_from(network, base)
-        if bottleneck and not has_prior:
-            prior = fit_prior(self._training_poses(objective), bottleneck)
-            network.set_prior(prior.mean, prior.components)  # type: ignore[operator]
-            log.info('the prior keeps %.2f %% of the variance of the poses', 100 * prior.explained_variance_ratio.sum())
-        if bottleneck and not recipe.train_prior:
-            network.head.reconstruction.requires_grad_(False)  # type: ignore[union-attr]
-        return objective
-
-    def _first_look(self, base: Checkpoint | None) -> Any:
-        """The network that tells the second look where to look."""
-        of: nn.Module | None = load_checkpoint(self.recipe.first).network if self.recipe.first else None
-        if of is None and base is not None and isinstance(base.network, TwoLooks):
-            of = base.network
-        first = of.first if isinstance(of, TwoLooks) else of
-        if not isinstance(first, HandDense) or first.joints != len(self.skeleton):
-            raise TrainingError(f'two_looks of {self.skeleton.name} need a hand_dense of these joints as the first: '
-                                '--set first=FILE')
-        return first
-
-    def _start_from(self, network: nn.Module, base: Checkpoint) -> bool:
-        """Take the weights of the base; False if it has none for the prior.
-
-        That it may lack, and what starts as the identity: further blocks of a stage, and the refinement. The second
-        of two looks may start as any hand_dense, but that its prior is another.
-        """
-        own = base.network.state_dict()
-        if isinstance(network, TwoLooks):
-            if isinstance(base.network, HandDense):
-                own = {f'second.{name}': value for name, value in own.items() if not name.startswith('head.')}
-            own |= {f'first.{name}': value for name, value in network.first.state_dict().items()}
-        lacking = network.state_dict().keys() - own.keys()
-        prior = {name for name in lacking if 'head' in name.split('.')}
-        try:
-            if needed := [name for name in lacking - prior if not ADDED.search(name)]:
-                raise RuntimeError(f'{min(needed)} is missing')
-            network.load_state_dict({**network.state_dict(), **own})
-        except RuntimeError as error:
-            raise TrainingError(f'{self.recipe.base} holds another network than the recipe names '
-                                f'({self.recipe.network}, {self.recipe.options})') from error
-        return not prior
-
-    def _training_poses(self, objective: PoseObjective) -> Tensor:
-        """Poses as the network will meet them: one shard, augmented in several ways, is plenty for a covariance."""
-        samples = self.shards.read(self.stream.first)
-        samples = {key: value.cpu() for key, value in samples.items() if key != 'patch'}
-        count, turns = len(samples['joints']), 8
-        numbers = torch.arange(turns * count).split(count)
-        batches = [augment(samples, self.recipe.augmentation, some, self.recipe.seed) for some in numbers]
-        return torch.cat([objective.poses(batch)[joints_count(batch)] for batch in batches])
 
     # The loop
 
@@ -340,6 +240,7 @@ class Run:
             batch, numbers = self.stream.batch(self.step)
             batch = {key: value.to(self.device, non_blocking=True) for key, value in batch.items()}
             batch = augment(batch, self.recipe.augmentation, numbers, self.recipe.seed)
+            # Another shift than in `augment`, so that an objective draws other numbers.
             batch['numbers'] = numbers.to(self.device) + (self.recipe.seed << 41)
         self._next = batch
 

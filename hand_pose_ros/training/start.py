@@ -1,0 +1,149 @@
+"""What a recipe trains, and what that starts from: fresh weights, those of other networks, the pose prior."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from hand_pose_ros.datasets.base import Dataset
+from hand_pose_ros.datasets.shards import DiskShards, MemoryShards
+from hand_pose_ros.models import REFINERS, build
+from hand_pose_ros.models.checkpoints import Checkpoint, load_checkpoint
+from hand_pose_ros.models.dense import ADDED, HandDense
+from hand_pose_ros.models.prior import fit_prior
+from hand_pose_ros.models.two_looks import TwoLooks
+from hand_pose_ros.skeleton import Skeleton
+from hand_pose_ros.training.augmentation import PRESETS, augment
+from hand_pose_ros.training.folder import TrainingError
+from hand_pose_ros.training.objectives import PoseObjective, RefinerObjective, joints_count, objective_for
+from hand_pose_ros.training.recipes import Recipe
+
+log = logging.getLogger(__name__)
+
+
+def first_shard(recipe: Recipe, base: Checkpoint | None, data: Dataset) -> int:
+    """Where the samples of a run begin: a refiner starts behind what its base was trained on.
+
+    Raises:
+        TrainingError: the base was trained on everything.
+    """
+    first = recipe.first_shard
+    if recipe.refiner and base and base.metadata.get('training_data') == data.name:
+        size = base.metadata.get('recipe', {}).get('shard_size', recipe.shard_size)
+        seen = int(base.metadata['training_shards']) * size
+        first = max(first, -(-seen // recipe.shard_size))
+        if data.size is not None and first * recipe.shard_size >= data.size:
+            raise TrainingError(f'{recipe.base} was trained on all of {data.name}, so a refiner would learn '
+                                'from estimates that are better than in use: train the base with --set '
+                                'last_shard=N, which leaves the shards from N on to the refiner')
+    return first
+
+
+def make_objective(recipe: Recipe, base: Checkpoint | None, shards: DiskShards | MemoryShards,
+                   first: int) -> PoseObjective | RefinerObjective:
+    """The network of a recipe with its loss, as it is before the first step.
+
+    Args:
+        base: what `recipe.base` names.
+        shards: the training samples; the pose prior is fitted to those of number `first`.
+
+    Raises:
+        TrainingError: parts of the recipe, or its base, do not go together.
+    """
+    skeleton = shards.dataset.skeleton
+    if recipe.refiner:
+        return _refiner_objective(recipe, base, skeleton)
+    network = _make_network(recipe, base, skeleton)
+    objective = objective_for(network, recipe, skeleton)
+    has_prior = base is not None and _start_from(network, base, recipe)
+    bottleneck = recipe.options.get('bottleneck')
+    if bottleneck and not has_prior:
+        prior = fit_prior(_training_poses(objective, shards.read(first), recipe), bottleneck)
+        network.set_prior(prior.mean, prior.components)  # type: ignore[operator]
+        log.info('the prior keeps %.2f %% of the variance of the poses', 100 * prior.explained_variance_ratio.sum())
+    if bottleneck and not recipe.train_prior:
+        network.head.reconstruction.requires_grad_(False)  # type: ignore[union-attr]
+    return objective
+
+
+def _refiner_objective(recipe: Recipe, base: Checkpoint | None, skeleton: Skeleton) -> RefinerObjective:
+    if base is None:
+        raise TrainingError('a refiner needs the checkpoint that it corrects: --set base=FILE')
+    if recipe.refiner not in REFINERS:
+        raise TrainingError(f'--set refiner={recipe.refiner}: choose one of {", ".join(REFINERS)}')
+    if base.metadata['skeleton'] != skeleton.name:
+        raise TrainingError(f'{recipe.base} gives joints of {base.metadata["skeleton"]}, but {recipe.dataset} '
+                            f'has those of {skeleton.name}: a refiner needs a base of the same')
+    return RefinerObjective(build(recipe.refiner, joints=len(skeleton)), base.network, recipe, skeleton)
+
+
+def _make_network(recipe: Recipe, base: Checkpoint | None, skeleton: Skeleton) -> nn.Module:
+    """With fresh weights, but for the first of two looks."""
+    if recipe.first and recipe.network != 'two_looks':
+        raise TrainingError(f'--set first=FILE is for --set network=two_looks, and {recipe.network} has one look')
+    if (recipe.network == 'hand_finder') != (recipe.dataset == 'scenes'):
+        raise TrainingError(f'{recipe.network} cannot learn from {recipe.dataset}: hand_finder, and nothing else, '
+                            'is trained with dataset=scenes')
+    if recipe.network == 'hand_finder' and recipe.augmentation != PRESETS['none']:
+        raise TrainingError('hand_finder has its own augmentation: leave out --set augmentation')
+    given: dict[str, Any] = {}
+    if recipe.network not in ('center_refiner', 'hand_finder'):
+        given['joints'] = len(skeleton)
+    first = None
+    if recipe.network == 'two_looks':
+        first = _first_look(recipe, base, skeleton)
+        given |= {'root': skeleton.root, 'knuckles': skeleton.knuckles,
+                  'first': {key: getattr(first, key) for key in ('width', 'bottleneck', 'blocks', 'refined')}}
+    if taken := sorted(given.keys() & recipe.options.keys()):
+        raise TrainingError(f'--set options.{taken[0]}: this follows from the dataset; leave it out')
+    network = build(recipe.network, **given, **recipe.options)
+    if first is not None:
+        network.first.load_state_dict(first.state_dict())  # type: ignore[union-attr]
+    return network
+
+
+def _first_look(recipe: Recipe, base: Checkpoint | None, skeleton: Skeleton) -> HandDense:
+    """The network that tells the second look where to look."""
+    of: nn.Module | None = load_checkpoint(recipe.first).network if recipe.first else None
+    if of is None and base is not None and isinstance(base.network, TwoLooks):
+        of = base.network
+    first = of.first if isinstance(of, TwoLooks) else of
+    if not isinstance(first, HandDense) or first.joints != len(skeleton):
+        raise TrainingError(f'two_looks of {skeleton.name} need a hand_dense of these joints as the first: '
+                            '--set first=FILE')
+    return first
+
+
+def _start_from(network: nn.Module, base: Checkpoint, recipe: Recipe) -> bool:
+    """Take the weights of the base; False if it has none for the prior.
+
+    That it may lack, and what starts as the identity: further blocks of a stage, and the refinement. The second
+    of two looks may start as any hand_dense, but that its prior is another.
+    """
+    own = base.network.state_dict()
+    if isinstance(network, TwoLooks):
+        if isinstance(base.network, HandDense):
+            own = {f'second.{name}': value for name, value in own.items() if not name.startswith('head.')}
+        own |= {f'first.{name}': value for name, value in network.first.state_dict().items()}
+    lacking = network.state_dict().keys() - own.keys()
+    prior = {name for name in lacking if 'head' in name.split('.')}
+    try:
+        if needed := [name for name in lacking - prior if not ADDED.search(name)]:
+            raise RuntimeError(f'{min(needed)} is missing')
+        network.load_state_dict({**network.state_dict(), **own})
+    except RuntimeError as error:
+        raise TrainingError(f'{recipe.base} holds another network than the recipe names '
+                            f'({recipe.network}, {recipe.options})') from error
+    return not prior
+
+
+def _training_poses(objective: PoseObjective, samples: dict[str, Tensor], recipe: Recipe) -> Tensor:
+    """Poses as the network will meet them: one shard, augmented in several ways, is plenty for a covariance."""
+    samples = {key: value.cpu() for key, value in samples.items() if key != 'patch'}
+    count, turns = len(samples['joints']), 8
+    numbers = torch.arange(turns * count).split(count)
+    batches = [augment(samples, recipe.augmentation, some, recipe.seed) for some in numbers]
+    return torch.cat([objective.poses(batch)[joints_count(batch)] for batch in batches])

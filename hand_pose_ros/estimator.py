@@ -104,6 +104,7 @@ class HandPoseEstimator:
         near, far: range in which hands are looked for, metres.
         tracking: look first where the hands of the last image were.
         smoothing: cutoff in Hz of a filter on the joints of a tracked hand at rest (see `smoothing`); 0 = none.
+        metadata: of the weights, for whoever publishes or writes joints (see `models.checkpoints`).
 
     Raises:
         InputError: there is no such side or range, or not one hand to look for.

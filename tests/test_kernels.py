@@ -54,10 +54,10 @@ def test_cuts_around_joints_in_the_image_at_its_border_and_outside(refiner):
     patch[:, :, :40] = FAR
     joints = torch.tensor([[[0, 0, 0], [0.31, -0.77, 0.4], [1, 1, -0.2]],
                            [[-1, 0.5, 0], [3, -7, 0], [-0.123, 0.456, 0.9]]], dtype=torch.float32)
-    for view in build(refiner).views:
-        image = _framed(patch, view)
-        answer = kernels.cut(image.to(DEVICE), joints.to(DEVICE), view).cpu()
-        torch.testing.assert_close(answer, cut(image, joints, view), rtol=0, atol=1e-5)
+    for region in build(refiner).regions:
+        image = _framed(patch, region)
+        answer = kernels.cut(image.to(DEVICE), joints.to(DEVICE), region).cpu()
+        torch.testing.assert_close(answer, cut(image, joints, region), rtol=0, atol=1e-5)
 
 
 def test_few_hands_are_computed_by_them_and_many_give_the_same():

@@ -244,11 +244,11 @@ def test_one_joint_equals_plain_convolutions_over_a_sampled_window(architecture)
 
     marked = torch.where(patch < 1, patch, torch.full_like(patch, 1e4))
     features = []
-    for view, branch in zip(refiner.views, refiner.branches, strict=True):
-        reach = view.width / 128
-        nearest = -F.max_pool2d(-marked, view.shrink)
+    for region, branch in zip(refiner.regions, refiner.branches, strict=True):
+        reach = region.width / 128
+        nearest = -F.max_pool2d(-marked, region.shrink)
         depth = ((nearest - estimate[0, joint, 2]) / reach).clamp(-1, 1)
-        cells = view.width // view.shrink
+        cells = region.width // region.shrink
         line = ((torch.arange(cells) + 0.5) / cells * 2 - 1) * reach
         grid = torch.stack([line.expand(cells, -1) + estimate[0, joint, 0],
                             line[:, None].expand(-1, cells) + estimate[0, joint, 1]], dim=-1)

@@ -28,6 +28,9 @@ Batch = dict[str, Tensor]
 - `cube_center` (B, 3) and `cube_side` (B,) float32, metres: `joints_in_metres` needs them. The centre of a mirrored
   patch is mirrored too (x negated)
 - `hand_present` (B,) bool: false where the patch shows no hand; its joints mean nothing then
+
+Training adds, after augmentation: `mirrored` (B,) bool, whether a patch was mirrored for the side to be learned, and
+`numbers` (B,) int64, seeds for what an objective draws. `SyntheticScenes` has other contents, and `shown`.
 """
 
 

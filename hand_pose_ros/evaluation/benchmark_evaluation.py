@@ -25,6 +25,8 @@ NEAR_MM = 20.0
 BINS = np.linspace(0, 1, 11)
 THIRDS = 3
 """Of the joints: frames are told apart by how many are visible."""
+NOMINAL = Intrinsics(475.0, 475.0, 320.0, 240.0, 640, 480)
+"""For results whose frames are of many cameras."""
 
 
 def evaluate_benchmark(model: str | None = None, device: str = 'auto', frames: int = benchmark.FRAMES,
@@ -69,7 +71,7 @@ def evaluate_benchmark(model: str | None = None, device: str = 'auto', frames: i
     if judged:
         info |= _self_knowledge(*(np.concatenate(parts) for parts in zip(*judged, strict=True)))
     note = 'crops and sides are those of the benchmark; cameras are mixed, the intrinsics are nominal'
-    return Result(str(model or DEFAULT), skeleton, Intrinsics(475.0, 475.0, 320.0, 240.0, 640, 480),
+    return Result(str(model or DEFAULT), skeleton, NOMINAL,
                   np.concatenate(joints), np.concatenate(truth), notes=(note,), info=info, in_time=False)
 
 

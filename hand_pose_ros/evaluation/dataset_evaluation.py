@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from hand_pose_ros.datasets import joints_in_metres, open_dataset
 from hand_pose_ros.datasets.base import RecordedDataset
@@ -41,12 +40,10 @@ def evaluate_dataset(name: str, root: Path | None, model: str | None = None, spl
     numbers = torch.arange(dataset.size).split(dataset.chunk)
     for indices in progress(numbers, len(numbers)):
         batch = dataset.batch(indices)
-
-        def in_metres(joints: Tensor, batch: dict[str, Tensor] = batch) -> np.ndarray:
-            return joints_in_metres(joints, batch['cube_center'], batch['cube_side']).double().numpy()
-
-        predictions.append(in_metres(torch.from_numpy(engine.run(batch['patch'].numpy()))))
-        truth.append(in_metres(batch['joints']))
+        cube = batch['cube_center'], batch['cube_side']
+        joints = torch.from_numpy(engine.run(batch['patch'].numpy()))
+        predictions.append(joints_in_metres(joints, *cube).double().numpy())
+        truth.append(joints_in_metres(batch['joints'], *cube).double().numpy())
     note = 'crops start from the labels, as in the original code; left hands are mirrored'
     return Result(f'{model or DEFAULT} on {dataset.name}', dataset.skeleton, dataset.frame(0).intrinsics,
                   np.concatenate(predictions), np.concatenate(truth), notes=(note,),

@@ -74,12 +74,12 @@ def over_time(result: Result) -> Figure:
     means, worst = metrics.frame_means_mm(errors), metrics.worst_joints_mm(errors)
     figure, (axes,) = _figure(10.5, 3.4)
     at, label = _time_axis(result)
-    _band(axes, at, worst, '#56B4E9', 'worst joint')
+    _band(axes, at, worst, COLORS[5], 'worst joint')
     _band(axes, at, means, COLORS[0], 'mean of joints')
     missed = metrics.missed_frames(errors)
     top = np.nanpercentile(worst[np.isfinite(worst)], 99.8) * 1.05 if np.isfinite(worst).any() else 1
     if missed.any():
-        axes.plot(at[missed], np.full(missed.sum(), 0.01 * top), '|', color='#D55E00', ms=9, clip_on=False,
+        axes.plot(at[missed], np.full(missed.sum(), 0.01 * top), '|', color=COLORS[1], ms=9, clip_on=False,
                   label='missed')
     for name, (start, _) in result.parts.items():
         axes.axvline(at[start], color='#4a5560', lw=1, ls=':')

@@ -28,13 +28,13 @@ class Layer(NamedTuple):
     pool: int
 
 
-class View(NamedTuple):
+class Region(NamedTuple):
     """What one branch looks at: a cube centred on the joint, and its layers."""
 
     width: int
     """Of the cube, in pixels of the patch."""
     shrink: int
-    """The view is taken from the patch pooled by this factor (the nearest reading of a square stays)."""
+    """The region is taken from the patch pooled by this factor (the nearest reading of a square stays)."""
     layers: tuple[Layer, ...]
 
 
@@ -43,19 +43,19 @@ class Refiner(nn.Module):
 
     Args:
         joints: J.
-        views: one for every branch.
+        regions: one for every branch.
         hidden: widths of the fully connected layers behind the branches.
         dropout: after each of them, while training.
     """
 
-    def __init__(self, joints: int, views: tuple[View, ...], hidden: tuple[int, ...],
+    def __init__(self, joints: int, regions: tuple[Region, ...], hidden: tuple[int, ...],
                  dropout: float) -> None:
         super().__init__()
-        self.joints, self.views = joints, views
-        self.branches = nn.ModuleList(nn.Sequential(*_branch(joints, view.layers)) for view in views)
+        self.joints, self.regions = joints, regions
+        self.branches = nn.ModuleList(nn.Sequential(*_branch(joints, region.layers)) for region in regions)
         features = 0
-        for view, branch in zip(views, self.branches, strict=True):
-            cells = view.width // view.shrink
+        for region, branch in zip(regions, self.branches, strict=True):
+            cells = region.width // region.shrink
             with torch.no_grad():
                 features += branch(torch.zeros(1, joints, cells, cells)).numel() // joints
         widths = (features, *hidden, 3)
@@ -74,15 +74,15 @@ class Refiner(nn.Module):
         The gradient reaches the weights through the last iteration only: where to look is taken as given.
         """
         marked = torch.where(patch < 1, patch, torch.full_like(patch, FAR))
-        images = [_framed(marked, view) for view in self.views]
+        images = [_framed(marked, region) for region in self.regions]
         for _ in range(iterations):
             joints = joints.detach()
-            joints = joints + self.offsets([self.cut(image, joints, view) for image, view in
-                                            zip(images, self.views, strict=True)])
+            joints = joints + self.offsets([self.cut(image, joints, region) for image, region in
+                                            zip(images, self.regions, strict=True)])
         return joints
 
     def offsets(self, windows: list[Tensor]) -> Tensor:
-        """For every view (B, J, N, N), centred on the estimates -> truth minus estimate (B, J, 3) in cube units."""
+        """For every region (B, J, N, N), centred on the estimates -> truth minus estimate (B, J, 3) in cube units."""
         features = [branch(window).unflatten(1, (self.joints, -1)).flatten(2)
                     for branch, window in zip(self.branches, windows, strict=True)]
         x = torch.cat(features, dim=2).transpose(0, 1)  # (J, B, F): one matrix product per joint
@@ -91,35 +91,35 @@ class Refiner(nn.Module):
             x = torch.baddbmm(bias, x, weight)
             if i < last:
                 x = self.dropout(F.relu(x))
-        return x.transpose(0, 1) * max(map(_reach, self.views))
+        return x.transpose(0, 1) * max(map(_reach, self.regions))
 
     def for_joint(self, joint: int) -> Refiner:
         """The network of one joint alone, a copy: what the grouped computation is compared with."""
-        alone = Refiner(1, self.views, tuple(bias.shape[2] for bias in self.biases)[:-1], self.dropout.p)
+        alone = Refiner(1, self.regions, tuple(bias.shape[2] for bias in self.biases)[:-1], self.dropout.p)
         state = {name: tensor.view(self.joints, -1)[joint] for name, tensor in self.state_dict().items()}
         alone.load_state_dict({name: state[name].view_as(tensor) for name, tensor in alone.state_dict().items()})
         return alone.train(self.training)
 
 
 class StdRef(Refiner):
-    """The convolutions of the Deep network on one view per joint, 64 pixels (half the cube) wide."""
+    """The convolutions of the Deep network on one region per joint, 64 pixels (half the cube) wide."""
 
     def __init__(self, joints: int = 21, hidden: tuple[int, ...] = (96, 96), dropout: float = 0.3) -> None:
-        view = View(64, 1, (Layer(8, 5, 2), Layer(8, 5, 2), Layer(8, 3, 1)))
-        super().__init__(joints, (view,), hidden, dropout)
+        region = Region(64, 1, (Layer(8, 5, 2), Layer(8, 5, 2), Layer(8, 3, 1)))
+        super().__init__(joints, (region,), hidden, dropout)
 
 
 class ORRef(Refiner):
-    """Overlapping regions: three views per joint; the smallest is not pooled, the larger the more.
+    """Overlapping regions: three per joint; the smallest is not pooled, the larger the more.
 
     So the network sees finely where the joint is, and coarsely what is around it.
     """
 
     def __init__(self, joints: int = 21, hidden: tuple[int, ...] = (96, 96), dropout: float = 0.3) -> None:
         super().__init__(joints, (
-            View(64, 2, (Layer(8, 5, 2), Layer(8, 3, 2))),
-            View(32, 1, (Layer(8, 5, 2), Layer(8, 3, 2))),
-            View(16, 1, (Layer(8, 5, 1), Layer(8, 3, 1))),
+            Region(64, 2, (Layer(8, 5, 2), Layer(8, 3, 2))),
+            Region(32, 1, (Layer(8, 5, 2), Layer(8, 3, 2))),
+            Region(16, 1, (Layer(8, 5, 1), Layer(8, 3, 1))),
         ), hidden, dropout)
 
 
@@ -139,26 +139,26 @@ FAR = 100.0
 """Stands for the background, so that it stays behind the back face whatever depth a window is centred on."""
 
 
-def _reach(view: View) -> float:
-    """From the centre of a view to its faces, in cube units."""
-    return view.width / PATCH_SIZE
+def _reach(region: Region) -> float:
+    """From the centre of a region to its faces, in cube units."""
+    return region.width / PATCH_SIZE
 
 
-def _framed(marked: Tensor, view: View) -> Tensor:
-    """(B, 1, 128, 128) -> (B, W, W): pooled for a view, with background around it."""
-    if view.shrink > 1:
-        marked = -F.max_pool2d(-marked, view.shrink)
-    border = view.width // view.shrink
+def _framed(marked: Tensor, region: Region) -> Tensor:
+    """(B, 1, 128, 128) -> (B, W, W): pooled for a region, with background around it."""
+    if region.shrink > 1:
+        marked = -F.max_pool2d(-marked, region.shrink)
+    border = region.width // region.shrink
     return F.pad(marked[:, 0], (border, border + 1) * 2, value=FAR)
 
 
-def cut(image: Tensor, joints: Tensor, view: View) -> Tensor:
-    """The cubes of a view around the joints (B, J, 3), as (B, J, N, N) in [-1, 1] like a patch.
+def cut(image: Tensor, joints: Tensor, region: Region) -> Tensor:
+    """The cubes of a region around the joints (B, J, 3), as (B, J, N, N) in [-1, 1] like a patch.
 
     Depth is taken relative to the joint and clipped to the cube, and then shifted by the fraction of a pixel
-    (bilinear), so that the views, and with them the result, follow the estimate without jumps.
+    (bilinear), so that the regions, and with them the result, follow the estimate without jumps.
     """
-    size, cells, reach = PATCH_SIZE // view.shrink, view.width // view.shrink, _reach(view)
+    size, cells, reach = PATCH_SIZE // region.shrink, region.width // region.shrink, _reach(region)
     stride = size + 2 * cells + 1
     joints = joints.float()  # a half has not the precision for positions
     # An estimate further out than the clamp sees nothing but background, wherever it is.

@@ -15,7 +15,7 @@ import triton.language as tl
 from torch import Tensor, nn
 
 from hand_pose_ros.geometry import PATCH_SIZE
-from hand_pose_ros.models.refiner import View
+from hand_pose_ros.models.refiner import Region
 
 HANDS = 16
 """For more at a time, PyTorch is faster: here weights are read for each hand anew, and pixels for each filter."""
@@ -134,11 +134,11 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor, relu: bool) -> Tensor:
     return y
 
 
-def cut(image: Tensor, joints: Tensor, view: View) -> Tensor:
-    """As `models.refiner.cut`, for views whose windows have a power of two of pixels."""
-    cells, lines, (hands, count, _) = view.width // view.shrink, 8, joints.shape
+def cut(image: Tensor, joints: Tensor, region: Region) -> Tensor:
+    """As `models.refiner.cut`, for regions whose windows have a power of two of pixels."""
+    cells, lines, (hands, count, _) = region.width // region.shrink, 8, joints.shape
     windows = image.new_empty(hands, count, cells, cells)
     _cut[(hands * count, cells // lines)](
-        image.contiguous(), joints.float().contiguous(), windows, count, PATCH_SIZE // view.shrink, image.shape[-1],
-        view.width / PATCH_SIZE, CELLS=cells, LINES=lines)
+        image.contiguous(), joints.float().contiguous(), windows, count, PATCH_SIZE // region.shrink, image.shape[-1],
+        region.width / PATCH_SIZE, CELLS=cells, LINES=lines)
     return windows

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -101,12 +102,6 @@ class _Crops:
         self._images = 0
         self.samples: list[tuple[Any, ...]] = []
 
-    def __enter__(self) -> _Crops:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
     def add(self, image: Frame, hands: Sequence[HandEstimate]) -> None:
         for hand in hands[:1]:
             patch, center = crop(image.depth, hand.cube, image.intrinsics), hand.cube.center
@@ -136,7 +131,7 @@ def look(bag: str | Path, settings: Settings, progress: Progress) -> Look:
         HandPoseError: bag, camera, truth or weights cannot be used.
     """
     crops = _Crops()
-    result = evaluate_bag(bag, settings, progress, lambda *_: crops)
+    result = evaluate_bag(bag, settings, progress, lambda *_: nullcontext(crops))
     return Look(result, *crops.batch())
 
 
@@ -185,7 +180,7 @@ def label(engine: Engine, rows: Tensor, crops: Batch, progress: Progress) -> Bat
     Raises:
         HandPoseError: there are too few.
     """
-    joints, spread = consensus(lambda patches: engine.run_full(patches)['joints'], crops, progress)
+    joints, spread = consensus(engine.run, crops, progress)
     cube = crops['cube_center'], crops['cube_side']
     points = joints_in_metres(joints, *cube)
     middle = points.mean(1)
@@ -258,7 +253,7 @@ def judge(found: Look, engine: Engine, progress: Progress) -> Numbers:
     _, crops = found.select(held)
     own: Numbers = {'disagreement_mm': None, 'explained': None}
     if len(crops['patch']):
-        _, spread = consensus(lambda patches: engine.run_full(patches)['joints'], crops, progress)
+        _, spread = consensus(engine.run, crops, progress)
         scores = [explain(patch, joints, float(side), HAND21)[1] for patch, joints, side in
                   zip(crops['patch'].numpy(), crops['joints'].numpy(), crops['cube_side'], strict=True)]
         own = {'disagreement_mm': 1000 * float(spread.mean()), 'explained': float(np.mean(scores))}

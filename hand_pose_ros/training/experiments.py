@@ -22,9 +22,9 @@ from torch import nn
 from hand_pose_ros.datasets import Batch, joints_in_metres
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.evaluation import plots
+from hand_pose_ros.evaluation.benchmark_evaluation import NOMINAL
 from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.files import write_bytes, write_json
-from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.models import REFINERS, build
 from hand_pose_ros.models.checkpoints import Checkpoint, load_checkpoint
 from hand_pose_ros.models.prior import fit_prior
@@ -49,8 +49,6 @@ ROUNDS = 10
 PAPER_MS = {'shallow': (0.07, 1.85), 'deep': (0.10, 2.08), 'multi_scale': (0.81, 5.36), 'deep-30': (0.09, 2.29),
             'deep-30 + or_ref': (2.38, 62.91)}
 """Run times in the paper, of the network alone: GTX 780 Ti, and i7 CPU; refinement is told without its first stage."""
-
-_MIXED = Intrinsics(475.0, 475.0, 320.0, 240.0, 640, 480)
 
 
 @dataclass
@@ -159,7 +157,7 @@ class Laboratory:
 
 def _result(name: str, skeleton: Skeleton, estimates: torch.Tensor, truths: torch.Tensor, **info: Any) -> Result:
     note = 'left hands are mirrored; crops as in training; cameras may be mixed: the intrinsics are nominal'
-    return Result(name, skeleton, _MIXED, estimates.double().numpy(), truths.double().numpy(), notes=(note,), info=info,
+    return Result(name, skeleton, NOMINAL, estimates.double().numpy(), truths.double().numpy(), notes=(note,), info=info,
                   in_time=False)
 
 

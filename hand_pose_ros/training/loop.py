@@ -50,9 +50,11 @@ class Machine:
     cache: Path
     """Folder of rendered and decoded samples, shared by all runs."""
     device: str = 'cpu'
+    """A name of PyTorch's, 'cuda:1' for example."""
     workers: int = 1
     """Processes that render or decode; 0 = in this process, on `device`, kept in its memory."""
     threads: int | None = None
+    """Of PyTorch in this process; None leaves them to it."""
     limit_gb: float = 40.0
     """Of the cache."""
     save_every_s: float = 120.0

@@ -63,8 +63,8 @@ class DenseObjective(PoseObjective):
     - the votes themselves, not only what they add up to: every cell that sees something learns from every sample
     - confidence: is the joint within 20 mm?
     - hand: does the patch show one? side: is it shown the right way round?
-    - size: logarithm of the hand's length over the usual one, where 0.19 m in a cube of 0.30 m is usual: the network
-      sees the hand in its cube and nothing else
+    - size: logarithm of the hand's length over TOLD_SIZE, 0.19 m in a cube of 0.30 m: the network sees the hand in its
+      cube and nothing else
     """
 
     CONFIDENT = 0.020

@@ -33,7 +33,7 @@ def save_state(path: Path, modules: dict[str, nn.Module], optimizer: Optimizer, 
 
 
 def load_progress(path: Path) -> dict[str, Any]:
-    """The plain values alone."""
+    """The plain values alone, of a file that exists and is whole."""
     with safe_open(path, 'pt') as file:
         return json.loads(file.metadata()['json'])
 

@@ -157,8 +157,8 @@ class Laboratory:
 
 def _result(name: str, skeleton: Skeleton, estimates: torch.Tensor, truths: torch.Tensor, **info: Any) -> Result:
     note = 'left hands are mirrored; crops as in training; cameras may be mixed: the intrinsics are nominal'
-    return Result(name, skeleton, NOMINAL, estimates.double().numpy(), truths.double().numpy(), notes=(note,), info=info,
-                  in_time=False)
+    return Result(name, skeleton, NOMINAL, estimates.double().numpy(), truths.double().numpy(), notes=(note,),
+                  info=info, in_time=False)
 
 
 def label(architecture: str, width: int | None) -> str:

@@ -129,7 +129,8 @@ class HandDense(nn.Module):
         joints (B, J, 3) in cube units; logits: confidence (B, J) that a joint is right, hand (B,) that this is one,
         side (B,) that it is a right hand; size (B,), the logarithm of the hand's size over TOLD_SIZE of the cube's
         side; and for the loss votes (B, J, 3), the joints before the prior, unrefined (B, J, 3), those before the
-        refinement, positions (B, 3, 32, 32), seen (B, 1, 32, 32), directions (B, J, 3, 32, 32), closeness (B, J, 32, 32).
+        refinement, positions (B, 3, 32, 32), seen (B, 1, 32, 32), directions (B, J, 3, 32, 32), closeness (B, J, 32,
+        32).
         """
         features, fused = pyramid(self.stem(patch), self.stages, self.laterals)
         fused = self.fuse(fused)  # (B, 2w, 32, 32)

@@ -385,3 +385,13 @@ def test_the_cache_forgets_what_was_used_longest_ago(tmp_path):
     finally:
         shards.close()
     assert sum(path.stat().st_size for path in (tmp_path / 'cache').rglob('*.safetensors')) <= 100_000
+
+
+def test_a_cache_too_small_for_one_shard_is_used_all_the_same(tmp_path):
+    write_icvl(tmp_path / 'icvl', np.random.default_rng(5))
+    opening = partial(open_dataset, 'icvl', 'test', tmp_path / 'icvl')
+    shards = DiskShards(opening, tmp_path / 'cache', 1, limit_gb=1e-6)
+    try:
+        assert [shards.read(number)['joints'].shape for number in (0, 1, 0)] == [(1, 16, 3)] * 3
+    finally:
+        shards.close()

@@ -239,7 +239,7 @@ def in_both_precisions(network: nn.Module, refiner: nn.Module | None, patches: n
     halved = copy.deepcopy(pipeline)
     fuse(halved.network)
     with torch.inference_mode():
-        expected, answer = (each(torch.from_numpy(patches))[0] for each in (pipeline, halved.half()))
+        expected, answer = (each(torch.from_numpy(patches))[0] for each in (pipeline, halved.reduce_precision()))
     assert answer.dtype == torch.float32
     return expected.numpy(), answer.numpy()
 

@@ -29,6 +29,7 @@ from hand_pose_ros.datasets.memory import keep_freed_memory
 
 log = logging.getLogger(__name__)
 
+
 def make_shard(dataset: Dataset, shard: int, shard_size: int) -> Batch:
     """The samples of one shard; patches as float16, which is 0.04 mm in a cube of 0.3 m."""
     end = (shard + 1) * shard_size if dataset.size is None else min((shard + 1) * shard_size, dataset.size)
@@ -205,11 +206,11 @@ def _make_file(shard: int, path: Path) -> None:
         temporary = path.with_suffix(f'.{os.getpid()}.tmp')
         save_file(tensors, temporary, metadata={'sha256': _checksum(tensors)})
         os.replace(temporary, path)
-    _limit_size(root, limit)
+    _limit_size(root, limit, path)
 
 
-def _limit_size(root: Path, limit: int) -> None:
-    """Delete the shards that were used longest ago; whoever has one open keeps it."""
+def _limit_size(root: Path, limit: int, made: Path) -> None:
+    """Delete the shards that were used longest ago, but not the one just made; whoever has one open keeps it."""
     files = []
     for path in root.glob('*/*.safetensors'):
         with suppress(FileNotFoundError):  # another process may make room, too
@@ -217,5 +218,5 @@ def _limit_size(root: Path, limit: int) -> None:
     used = 0
     for _, size, path in sorted(files, reverse=True):
         used += size
-        if used > limit:
+        if used > limit and path != made:
             path.unlink(missing_ok=True)

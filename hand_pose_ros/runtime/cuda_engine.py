@@ -42,7 +42,7 @@ class CudaEngine(Engine):
         self.outputs, self.device = pipeline.outputs, torch.device(device)
         fuse(pipeline, _own_kernels(self.device))
         pipeline.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.pipeline = pipeline.to(self.device).half()
+        self.pipeline = pipeline.to(self.device).reduce_precision()
         self.stream = torch.cuda.Stream(self.device)
         self.captured: dict[int, _Captured] = {}
         self._captured_for(1)  # the first image shall not wait

@@ -25,13 +25,13 @@ class Pipeline(nn.Module):
         self.network, self.refiner = network, refiner
         self.outputs: tuple[str, ...] = getattr(network, 'outputs', ('joints',))
 
-    def half(self) -> Pipeline:
-        """In half precision, where that moves no joint by half a millimetre.
+    def reduce_precision(self) -> Pipeline:
+        """Make half precision of all weights where that moves no joint by half a millimetre.
 
-        Nothing is with a refiner, to which it matters much where it is told that a joint is; nor where norms are no
-        part of the weights (`fused.fuse`), as a layer before one may give more than a half can hold. A first look is
-        not, as the view of the second is rounded and must not depend on it; nor the stem of a dense network, whose
-        weights, rounded, move joints by more than all others together.
+        These stay in single precision: everything if there is a refiner, for which positions must be exact, or a norm
+        that is no part of the weights (`fused.fuse`), before which a layer may give more than a half can hold; a first
+        look, as the view of the second is rounded and must not depend on it; and the stem of a dense network, whose
+        rounded weights move joints by more than all others together.
         """
         if self.refiner is not None or any(isinstance(module, nn.BatchNorm2d) for module in self.modules()):
             return self

@@ -8,10 +8,11 @@ from io import BytesIO
 from pathlib import Path
 
 import numpy as np
+import torch
 from PIL import Image
 
+from hand_pose_ros.datasets import open_dataset
 from hand_pose_ros.evaluation.benchmark_evaluation import evaluate_benchmark
-from hand_pose_ros.synthetic.benchmark import frames
 from hand_pose_ros.training.figures import qualitative
 
 FRAMES = 1000
@@ -22,7 +23,8 @@ SHARES = (0.25, 0.5, 0.75, 0.9, 0.97, 1.0)
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('models', nargs='+', metavar='NAME', help='of weights that ship')
-    models, batches = parser.parse_args().models, list(frames(FRAMES))
+    models, hands = parser.parse_args().models, open_dataset('synthetic', 'test')
+    batches = [hands.batch(numbers) for numbers in torch.arange(FRAMES).split(hands.chunk)]
     for model in models:
         result = evaluate_benchmark(model, 'cpu', FRAMES)
         order = np.argsort(result.errors_mm.mean(axis=1))

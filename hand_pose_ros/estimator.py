@@ -33,8 +33,8 @@ from hand_pose_ros.smoothing import OneEuroFilter
 __all__ = ['HandEstimate', 'HandPoseEstimator', 'Side']
 
 RECENTER_M = 0.03
-"""A cube whose centre is further than this from the middle of the joints it gave is moved there and read again. On
-synthetic images half as much is no nearer, and asks for a second reading two and a half times as often."""
+"""A cube whose centre is further than this from the middle of the joints it gave is moved there and read again. Half
+this distance is no more accurate on synthetic images, and costs two and a half times as many second readings."""
 READINGS = 3
 """How often at most: on synthetic images two readings find a hand more often than one, three more often than two."""
 FALSE_ALARMS = 3

@@ -17,7 +17,7 @@ JOINT_TOLERANCE_M = 0.008
 FLESH_M = 0.025
 """A joint further than this behind the surface is hidden by something else than its own flesh."""
 HIDDEN_CONFIDENCE = 0.5
-"""What a joint is given that nothing speaks for or against."""
+"""Of a joint for which there is no evidence either way."""
 REACH_M = 0.022
 """Surface further than this from every bone is not explained by the skeleton."""
 

@@ -33,7 +33,7 @@ _RADII = ((0.400, 0.238, 0.229), (0.231, 0.196, 0.176), (0.228, 0.199, 0.180), (
 
 @dataclass(frozen=True)
 class Shape:
-    """The measures of B right hands, in metres, in the hand frame (see `hand_pose_ros.synthetic.hand`).
+    """The measures of B right hands, in metres, in the hand frame (see `hand_pose_ros.synthetic.kinematics`).
 
     Attributes:
         hand_length: (B,) wrist to the end of the middle finger.

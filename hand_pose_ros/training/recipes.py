@@ -49,10 +49,14 @@ class Recipe:
 
     # Optimisation
     loss: str = 'huber'
+    """Of the joints: 'huber', 'smooth_l1' or 'squared', see `losses.joint_loss`."""
     knee: float = 0.1
+    """Error in cube units (0.1 is 15 mm in a cube of 0.3 m) from which a loss grows linearly; 'squared' has none."""
     optimizer: str = 'sgd'
+    """'sgd', 'rmsprop', 'adamw' or 'muon'."""
     learning_rate: float = 0.01
     schedule: str = 'constant'
+    """Of the learning rate: 'constant', 'hyperbolic' or 'cosine'."""
     warmup: float = 0.0
     """Share of the budget in which the learning rate rises linearly from 0."""
     momentum: float = 0.9

@@ -19,6 +19,7 @@ from hand_pose_ros.cli.arguments import (
     add_bag,
     add_estimator,
     bag_options,
+    check_outputs,
     count,
     estimator_options,
     keep_input,
@@ -28,7 +29,7 @@ from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.evaluation import published
 from hand_pose_ros.evaluation.results import Result, told_notes
 from hand_pose_ros.evaluation.tables import ACCURACY_COLUMNS, accuracy_rows, number, text_table
-from hand_pose_ros.files import check_writable, write_json
+from hand_pose_ros.files import write_json
 
 if TYPE_CHECKING:
     from hand_pose_ros.evaluation.bag_evaluation import Settings
@@ -94,11 +95,9 @@ def run(args: argparse.Namespace) -> int:
     if args.out and len(args.bags) < 2 and Path(args.out).suffix != '.npz':
         args.parser.error(f'--out {args.out}: the result is an .npz file')
     out = Path(args.out) / 'any.npz' if args.out and len(args.bags) > 1 else args.out
-    for path in filter(None, (args.json, out, args.report and Path(args.report) / 'report.html')):
-        for source in (*args.bags, args.ground_truth, args.predictions,
-                       *(compared.rpartition('=')[2] for compared in args.compare)):
-            keep_input(path, source)
-        check_writable(path)  # now, not after minutes of work
+    compared = [published.split_source(source)[1] for source in args.compare]
+    check_outputs((args.json, out, args.report and Path(args.report) / 'report.html'),
+                  (*args.bags, args.ground_truth, args.predictions, *compared))
     if args.predictions:
         refuse(args, (*ESTIMATOR, 'depth_topic', 'camera_info_topic', 'depth_scale', 'out_bag', 'via_ros', 'jobs',
                       'root', 'split'), 'is for bags and recorded datasets: these joints are estimated already')

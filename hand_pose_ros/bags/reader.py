@@ -17,6 +17,7 @@ from hand_pose_ros.bags.bag import CAMERA_INFO, COMPRESSED_IMAGE, HANDS, IMAGE, 
 from hand_pose_ros.depth import DEPTH_ENCODINGS, decode_compressed, decode_image
 from hand_pose_ros.errors import InputError, naming
 from hand_pose_ros.geometry import Intrinsics
+from hand_pose_ros.skeleton import SKELETONS
 
 _TRANSPORTS = ('compressedDepth', 'compressed')
 
@@ -225,10 +226,12 @@ def check_frame(source: str, hands: str, images: str) -> None:
 
 def _recorded_hands(message: Any, source: str) -> RecordedHands:
     counts = {count for hand in message.hands for count in (len(hand.joints), len(hand.confidence))}
-    if len(counts) > 1:
-        raise InputError(f'{source}: the hands of one message have {sorted(counts)} joints and confidences: '
-                         'they must be as many as the skeleton has')
-    shape = (len(message.hands), max(counts, default=0))
+    known = SKELETONS.get(message.skeleton)
+    count = len(known) if known else max(counts, default=0)
+    if counts - {count}:
+        raise InputError(f'{source}: the hands of one message have {sorted(counts)} joints and confidences, but all '
+                         f'must have {count} ({message.skeleton}): record as many, or name another skeleton')
+    shape = (len(message.hands), count)
     joints = [[(point.x, point.y, point.z) for point in hand.joints] for hand in message.hands]
     return RecordedHands(
         _stamp_ns(message.header), message.header.frame_id, message.skeleton,

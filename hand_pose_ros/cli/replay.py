@@ -16,6 +16,8 @@ _EXAMPLES = """examples:
 While it plays, pause and go on with
   ros2 service call /replay/pause std_srvs/srv/SetBool "{data: true}"     (or false)
 """
+_ENDLESS = 1e9
+"""Beyond it nanoseconds do not fit into the times of messages."""
 
 
 def add_parser(subparsers: Any) -> None:
@@ -46,10 +48,10 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         HandPoseError: there is no ROS, or the bag cannot be read.
     """
-    if not args.rate > 0:
-        args.parser.error(f'--rate {args.rate}: must be more than 0')
-    if not args.start >= 0:
-        args.parser.error(f'--start {args.start}: must not be negative')
+    if not 0 < args.rate <= _ENDLESS:
+        args.parser.error(f'--rate {args.rate:g}: must be more than 0, and finite')
+    if not 0 <= args.start <= _ENDLESS:
+        args.parser.error(f'--start {args.start:g}: must be 0 or more, and finite')
     from hand_pose_ros.ros.replay import replaying  # says what is missing where there is no ROS
 
     with replaying(args.bag, args.ros_args, topics=args.topics, rate=args.rate, reliability=args.qos, clock=args.clock,

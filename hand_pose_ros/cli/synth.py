@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hand_pose_ros.cli.arguments import count
+from hand_pose_ros.cli.arguments import count, none_or_more
 from hand_pose_ros.errors import HandPoseError
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def add_parser(subparsers: Any) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter)
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument('--split', default='train', choices=('train', 'val', 'test'), help='(train)')
-    common.add_argument('--start', type=int, default=0, metavar='I', help='index of the first sample (0)')
+    common.add_argument('--start', type=none_or_more, default=0, metavar='I', help='index of the first sample (0)')
     common.add_argument('--sensors', nargs='+', metavar='NAME',
                         help=f'of {", ".join(sensor.name for sensor in SENSORS)} (all)')
     common.add_argument('--rig', type=Path, metavar='GLB', help="another skin: a glTF hand with WebXR's joint names")
@@ -199,7 +199,7 @@ def _record(args: argparse.Namespace) -> None:
             truth = HandEstimate(joints, HAND21.joint_names, np.ones(len(HAND21), np.float32), 1.0, side,
                                  Cube((float(middle[0]), float(middle[1]), float(middle[2])), 0.3), 'truth')
             bag.write_depth(stamp, frame, depth, camera, codec=None if args.raw else 'png')
-            bag.write_hands(stamp, frame, [truth] if side != 'none' else [], topic='/truth/joints')
+            bag.write_hands(stamp, frame, [truth], topic='/truth/joints')
     print(f'{args.out}: {args.number} images')
 
 

@@ -15,6 +15,7 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
 from hand_pose_ros import markers as markers_module
+from hand_pose_ros.conventions import stamp_ns
 from hand_pose_ros.depth import depth_problem
 from hand_pose_ros.drawing import FINGER_COLORS
 from hand_pose_ros.errors import HandPoseError, InputError
@@ -23,7 +24,7 @@ from hand_pose_ros.geometry import Cube, Intrinsics
 from hand_pose_ros.markers import HandMarkers
 from hand_pose_ros.resources import resource
 from hand_pose_ros.ros.camera import Camera
-from hand_pose_ros.ros.conversions import hand_from_msg, hands_to_msg, markers_to_msg, skeleton_to_msg, stamp_ns
+from hand_pose_ros.ros.conversions import hand_from_msg, hands_to_msg, markers_to_msg, skeleton_to_msg
 from hand_pose_ros.ros.diagnostics import Statistics
 from hand_pose_ros.ros.params import Params, markdown_table, yaml_file
 from hand_pose_ros.skeleton import HAND21

@@ -575,6 +575,14 @@ def test_silence_names_the_topic_and_its_publishers(rig: Rig, monkeypatch: pytes
     assert sum('/somewhere/else' in text for text in rig.said()) == 1
 
 
+def test_depth_that_is_only_raw_is_found(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(node_module, 'SILENCE_S', 0.1)
+    rig.client.create_publisher(Image, 'depth/image_rect', RELIABLE)
+    rig.start(transport='compressedDepth')
+    rig.until_said('no image arrived on /depth/image_rect/compressedDepth',
+                   'depth is published on /depth/image_rect: set the parameter transport to raw')
+
+
 @pytest.mark.parametrize('transport', ['compressedDepth', 'compressed'])
 def test_depth_that_is_only_compressed_is_found(rig: Rig, monkeypatch: pytest.MonkeyPatch, transport: str) -> None:
     monkeypatch.setattr(node_module, 'SILENCE_S', 0.1)

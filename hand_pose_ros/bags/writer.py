@@ -15,6 +15,7 @@ from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLi
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from hand_pose_ros.bags.bag import CAMERA_INFO, COMPRESSED_IMAGE, HAND, HANDS, IMAGE, SIDES, SKELETON, typestore
+from hand_pose_ros.conventions import camera_info_beside, join_transport
 from hand_pose_ros.depth import encode_compressed, to_units
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.geometry import Intrinsics
@@ -90,7 +91,7 @@ class BagWriter:
         """
         header = self._header(stamp_ns, frame_id)
         info = self._camera_info(header, intrinsics)
-        self.write(f'{topic.rpartition("/")[0]}/camera_info', CAMERA_INFO, info, stamp_ns)
+        self.write(camera_info_beside(topic), CAMERA_INFO, info, stamp_ns)
         if codec is None:
             units = to_units(depth, depth_scale).astype('<u2')
             height, width = units.shape
@@ -99,7 +100,7 @@ class BagWriter:
                 data=units.view(np.uint8).ravel()), stamp_ns)
         else:
             name, data = encode_compressed(depth, codec, depth_scale)
-            self.write(f'{topic}/compressedDepth', COMPRESSED_IMAGE, self._types[COMPRESSED_IMAGE](
+            self.write(join_transport(topic, 'compressedDepth'), COMPRESSED_IMAGE, self._types[COMPRESSED_IMAGE](
                 header=header, format=name, data=np.frombuffer(data, np.uint8)), stamp_ns)
 
     def write_hands(self, stamp_ns: int, frame_id: str, hands: Sequence[HandEstimate], skeleton: Skeleton = HAND21,

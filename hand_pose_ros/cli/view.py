@@ -26,6 +26,7 @@ from hand_pose_ros.cli.arguments import (
     refuse,
 )
 from hand_pose_ros.cli.estimate import from_bag
+from hand_pose_ros.conventions import TRANSPORTS
 from hand_pose_ros.depth import to_units
 from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.files import in_one_step
@@ -58,8 +59,7 @@ def add_parser(subparsers: Any) -> None:
     add_estimator(bag)
     bag.add_argument('--max-hands', type=count, default=2, metavar='N', help='at most N hands per image (2)')
     live = parser.add_argument_group('live')
-    live.add_argument('--transport', default='raw', choices=('raw', 'compressedDepth', 'compressed'),
-                      help='of the depth images (raw)')
+    live.add_argument('--transport', default='raw', choices=TRANSPORTS, help='of the depth images (raw)')
     live.add_argument('--ros-args', nargs=argparse.REMAINDER, default=[], metavar='...',
                       help='remappings (-r from:=to) and so on, as with ros2 run')
 

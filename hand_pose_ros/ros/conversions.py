@@ -29,11 +29,6 @@ SIDES: dict[Side, int] = {'unknown': HandJoints.UNKNOWN, 'left': HandJoints.LEFT
 _SIDE_NAMES = {number: side for side, number in SIDES.items()}
 
 
-def stamp_ns(header: Header) -> int:
-    """The stamp of a header in nanoseconds."""
-    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
-
-
 def hands_to_msg(header: Header, hands: Sequence[HandEstimate], skeleton: Skeleton) -> HandJointsArray:
     """All hands of one image; `header` is that of the image, and is copied as it is."""
     return HandJointsArray(header=header, skeleton=skeleton.name, hands=[hand_to_msg(hand) for hand in hands])

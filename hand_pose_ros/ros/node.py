@@ -27,6 +27,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
 from hand_pose_ros import ros
+from hand_pose_ros.conventions import stamp_ns
 from hand_pose_ros.depth import decode_compressed, decode_image, depth_problem
 from hand_pose_ros.detection import Region
 from hand_pose_ros.errors import HandPoseError
@@ -36,7 +37,6 @@ from hand_pose_ros.models.checkpoints import DEFAULT
 from hand_pose_ros.ros import params as parameters
 from hand_pose_ros.ros import qos, topics
 from hand_pose_ros.ros.camera import Camera
-from hand_pose_ros.ros.conversions import stamp_ns
 from hand_pose_ros.ros.diagnostics import Statistics
 from hand_pose_ros.ros.outputs import Outputs
 from hand_pose_ros.ros.worker import NewestWorker

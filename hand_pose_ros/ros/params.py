@@ -14,6 +14,7 @@ from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from hand_pose_ros.conventions import TRANSPORTS
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.estimator import HandPoseEstimator
 
@@ -41,7 +42,7 @@ class Params:
                                   high=256, fixed=_CONFIGURED)
     transport: str = _parameter('raw', 'How depth arrives: raw takes the image topic itself, the others take '
                                 '<image topic>/<transport> (sensor_msgs/CompressedImage).',
-                                choices=('raw', 'compressedDepth', 'compressed'), fixed=_CONFIGURED)
+                                choices=TRANSPORTS, fixed=_CONFIGURED)
     depth_scale: float = _parameter(0.001, 'Metres per unit of 16-bit depth; 32FC1 is in metres already.',
                                     low=1e-5, high=1.0)
     use_rectified: bool = _parameter(True, 'Take the intrinsics from P of camera_info (rectified images) instead of K.')

@@ -170,7 +170,7 @@ def _evaluate_live(args: argparse.Namespace, settings: Settings) -> Result:
         args.parser.error('--out-bag does not work with --via-ros: record /hand/joints instead')
     from hand_pose_ros.bags import DepthBag
     from hand_pose_ros.evaluation.ground_truth import read_truth, with_truth
-    from hand_pose_ros.models.checkpoints import load_checkpoint
+    from hand_pose_ros.models.checkpoints import DEFAULT, load_checkpoint
     from hand_pose_ros.ros.live import play_through_node
     from hand_pose_ros.skeleton import get_skeleton
 
@@ -198,7 +198,7 @@ def _evaluate_live(args: argparse.Namespace, settings: Settings) -> Result:
     result = Result(
         Path(args.bags[0]).stem, skeleton, first.intrinsics, joints, stamps_ns=np.array(stamps),
         seconds={'image to joints': latency}, notes=notes if dropped else (), info={
-            'bag': args.bags[0], 'depth_topic': topic, 'model': args.model or 'default', 'device': args.device,
+            'bag': args.bags[0], 'depth_topic': topic, 'model': args.model or DEFAULT, 'device': args.device,
             'via_ros': True, 'dropped': dropped, 'damaged': False})
     return with_truth(result, truth, first.frame_id) if truth else result
 

@@ -151,10 +151,10 @@ def estimate(images: Iterator[DepthInput], count: int, estimator: HandPoseEstima
 
 def _open(args: argparse.Namespace, stack: ExitStack) -> tuple[Iterator[DepthInput], int]:
     """The images of the input, and how many there are."""
-    is_png = args.input.suffix.lower() == '.png'
-    paths = [args.input] if is_png else sorted(args.input.glob('*.png'), key=_natural) if args.input.is_dir() else []
+    candidates = list(args.input.iterdir()) if args.input.is_dir() else [args.input]
+    paths = sorted((path for path in candidates if path.suffix.lower() == '.png'), key=_natural)
     if args.input.is_dir() and not paths and not any(
-            path.suffix in ('.mcap', '.db3', '.yaml') for path in args.input.iterdir()):
+            path.suffix in ('.mcap', '.db3', '.yaml') for path in candidates):
         raise InputError(f'{args.input}: the folder holds neither 16-bit depth .png files nor a bag')
     if paths:
         if args.intrinsics is None:
@@ -191,7 +191,7 @@ def from_bag(bag: DepthBag) -> Iterator[DepthInput]:
 
 def _natural(path: Path) -> list[Any]:
     """Sorts 30.png before 110.png."""
-    return [int(part) if part.isdigit() else part for part in re.split(r'(\d+)', path.name)]
+    return [int(part) if part.isdecimal() else part for part in re.split(r'(\d+)', path.name)]
 
 
 class _Overlays:

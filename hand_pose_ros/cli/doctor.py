@@ -24,7 +24,8 @@ EXAMPLES = """examples:
 
 Each line begins with ok, note (worth knowing) or WRONG (with what to do). The exit code is 1 if anything is WRONG.
 """
-LIBRARIES = ('numpy', 'cv2', 'torch', 'safetensors', 'onnx', 'onnxruntime', 'rosbags', 'scipy', 'matplotlib', 'tqdm')
+LIBRARIES = ('numpy', 'cv2', 'torch', 'safetensors', 'onnx', 'onnxruntime', 'rosbags', 'scipy', 'matplotlib', 'tqdm',
+             'filelock')
 SHARED_MEMORY = Path('/dev/shm')
 DEFAULT_SEGMENT = 512 * 1024
 """Bytes of the shared-memory segment of Fast DDS where no profile says otherwise."""

@@ -473,6 +473,17 @@ def test_an_image_waits_for_the_camera_info_that_comes_after_it(rig: Rig) -> Non
     assert (first.x, first.y, first.z) == pytest.approx((second.x, second.y, second.z), abs=0.2)
 
 
+def test_to_stop_while_an_image_waits_for_its_camera_info_is_no_complaint(rig: Rig) -> None:
+    rig.start(camera_info_timeout=9.0)
+    publish = rig.camera(RELIABLE)
+    publish(image(depth_with_hand()))
+    rig.until(lambda: rig.node._camera._changed._waiters, 'the image to wait')
+    assert rig.transition('deactivate') and rig.transition('activate')
+    rig.until(lambda: sum('listening to' in text for text in rig.said()) == 2, 'to hear all that was said before')
+    assert not any('camera_info arrived' in text for text in rig.said())
+    assert rig.answer(rig.camera(info=camera_info()), image(depth_with_hand())).hands
+
+
 def no_data(message: Image) -> None:
     message.data = array('B')
 

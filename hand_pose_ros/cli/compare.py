@@ -7,7 +7,6 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -19,6 +18,8 @@ from hand_pose_ros.evaluation.published import DATASETS, load_result, split_sour
 from hand_pose_ros.evaluation.results import Result, told_notes
 from hand_pose_ros.files import write_json
 
+DESCRIPTION = 'Tables and curves of any number of results, and confidence intervals of their differences.'
+
 EXAMPLES = """examples:
   hand-pose compare a.npz b.npz --out plots
   hand-pose compare 'before=a.npz' 'after=b.npz' --json difference.json
@@ -29,13 +30,8 @@ hold 0 is more than chance on these frames.
 """
 
 
-def add_parser(subparsers: Any) -> None:
-    """Add this verb to the command line."""
-    parser = subparsers.add_parser(
-        'compare', help='several results side by side', epilog=EXAMPLES,
-        description='Tables and curves of any number of results, and confidence intervals of their differences.',
-        formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.set_defaults(error=parser.error)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what the verb takes."""
     parser.add_argument('results', nargs='+', metavar='[NAME=]FILE',
                         help='.npz of `hand-pose evaluate --out`, or predictions as text')
     parser.add_argument('--ground-truth', metavar='G', help='labels of the predictions that are text')
@@ -49,7 +45,7 @@ def add_parser(subparsers: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Compare, print, and write what was asked for."""
     if len(args.results) < 2:
-        args.error('give at least two results')
+        args.parser.error('give at least two results')
     check_outputs((args.json, args.out and Path(args.out) / 'report.html'),
                   (args.ground_truth, *(split_source(source)[1] for source in args.results)))
     dataset = DATASETS[args.dataset] if args.dataset else None

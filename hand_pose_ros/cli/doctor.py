@@ -12,11 +12,13 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 from xml.etree import ElementTree
 
 from hand_pose_ros import __version__
 from hand_pose_ros.errors import HandPoseError
+
+DESCRIPTION = 'Say what is installed here, whether it works, and what to do where it does not.'
 
 EXAMPLES = """examples:
   hand-pose doctor
@@ -38,11 +40,8 @@ Findings = Iterator[tuple[Literal['ok', 'note', 'WRONG'], str]]
 """What a check has to say, a line each."""
 
 
-def add_parser(subparsers: Any) -> None:
-    """Add this verb to the command line."""
-    subparsers.add_parser('doctor', help='what is installed, whether it works, and what to do where it does not',
-                          description='Say what is installed here, whether it works, and what to do where it does not.',
-                          epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what the verb takes."""
 
 
 def run(args: argparse.Namespace) -> int:

@@ -39,7 +39,9 @@ from hand_pose_ros.skeleton import Skeleton
 if TYPE_CHECKING:
     from hand_pose_ros.estimator import HandPoseEstimator
 
-_EXAMPLES = """examples:
+DESCRIPTION = 'The joints of every depth image of a bag or a folder, as numbers, as a bag and as pictures.'
+
+EXAMPLES = """examples:
   hand-pose estimate recording.mcap --out joints.npz --overlay pictures
   hand-pose estimate old.bag --depth-topic /camera/depth/image_raw --out joints.mcap
   hand-pose estimate frames/ --intrinsics 363.9 363.9 255.4 206.3 --overlay pictures
@@ -52,12 +54,8 @@ cube_center, cube_side; and once: names and stamp_ns of the images, joint_names,
 _PNG_PERIOD_NS = 33_333_333
 
 
-def add_parser(subparsers: Any) -> None:
-    """Declare the verb."""
-    parser = subparsers.add_parser(
-        'estimate', help='joints and pictures from a bag or from 16-bit depth PNGs',
-        description='The joints of every depth image of a bag or a folder, as numbers, as a bag and as pictures.',
-        epilog=_EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what the verb takes."""
     parser.add_argument('input', metavar='INPUT', type=Path, help='a bag (ROS 1, sqlite3, MCAP), a 16-bit depth PNG, '
                         'or a folder of them')
     add_bag(parser)
@@ -65,7 +63,6 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('--max-hands', type=count, default=2, metavar='N', help='at most N hands per image (2)')
     parser.add_argument('--out', type=Path, metavar='FILE', help='.npz or .mcap')
     parser.add_argument('--overlay', type=Path, metavar='FOLDER', help='a picture of every image with its joints')
-    parser.set_defaults(parser=parser)
 
 
 def run(args: argparse.Namespace) -> int:

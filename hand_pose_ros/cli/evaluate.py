@@ -34,6 +34,9 @@ from hand_pose_ros.files import write_json
 if TYPE_CHECKING:
     from hand_pose_ros.evaluation.bag_evaluation import Settings
 
+DESCRIPTION = ('Score predictions in a text file against labels, or run the estimator over bags and score it, or '
+               'only time it if there is no ground truth.')
+
 EXAMPLES = """examples:
   hand-pose evaluate --predictions NYU.txt.gz --ground-truth labels.txt.gz --dataset nyu --report out
   hand-pose evaluate recording.mcap --report out
@@ -48,13 +51,8 @@ or not.
 """
 
 
-def add_parser(subparsers: Any) -> None:
-    """Add this verb to the command line."""
-    parser = subparsers.add_parser(
-        'evaluate', help='score a prediction file, or the estimator on a bag', epilog=EXAMPLES,
-        description='Score predictions in a text file against labels, or run the estimator over bags and score it, or '
-                    'only time it if there is no ground truth.', formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.set_defaults(parser=parser)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what the verb takes."""
     parser.add_argument('bags', nargs='*', metavar='BAG', help='a ROS 1 file, a ROS 2 folder, '
                         'or an .mcap or .db3 file; or '
                         'synthetic-test-v1, the benchmark, which is made on the spot; or nyu, icvl, msra or msra:P1 to '

@@ -35,7 +35,9 @@ from hand_pose_ros.hand import HandEstimate
 from hand_pose_ros.markers import DELETE, SPHERE_LIST, HandMarkers, Marker
 from hand_pose_ros.skeleton import Skeleton
 
-_EXAMPLES = """examples:
+DESCRIPTION = 'Show depth images and hands in 3D with Rerun: those of a bag, or of live topics.'
+
+EXAMPLES = """examples:
   hand-pose view recording.mcap
   hand-pose view recording.mcap --save recording.rrd     (open it later, or elsewhere, with: rerun recording.rrd)
   hand-pose view --ros-args -r depth/image_rect:=/camera/camera/depth/image_rect_raw
@@ -44,13 +46,8 @@ Without a bag it shows what a camera and the node `estimator` publish, until Ctr
 """
 
 
-def add_parser(subparsers: Any) -> None:
-    """Declare the verb."""
-    parser = subparsers.add_parser(
-        'view', help='depth images and hands in 3D, live or from a bag', epilog=_EXAMPLES,
-        description='Show depth images and hands in 3D with Rerun: those of a bag, or of live topics.',
-        formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.set_defaults(parser=parser)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what the verb takes."""
     parser.add_argument('bag', metavar='BAG', type=Path, nargs='?', help='a .bag, .mcap or .db3 file, or a ROS 2 '
                         'folder: its hands are estimated; without it, live topics are shown')
     parser.add_argument('--save', metavar='FILE', type=Path, help='write an .rrd file instead of opening the viewer')

@@ -104,8 +104,9 @@ class DepthBag(Bag):
         count = 0
         try:
             for connection in self._infos:  # an image that was recorded before its camera_info takes the first one
-                infos = (self.deserialize(connection, data) for _, _, data in self.messages([connection]))
-                any(self._remember(connection, info, cameras) for info in infos)
+                for _, _, data in self.messages([connection]):
+                    if self._remember(connection, self.deserialize(connection, data), cameras):
+                        break
             for connection, _, data in self.messages([*self._images, *self._infos]):
                 message = self.deserialize(connection, data)
                 if connection.msgtype == CAMERA_INFO:

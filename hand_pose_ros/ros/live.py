@@ -81,9 +81,12 @@ def play_through_node(bag: DepthBag, camera_info_topic: str | None = None,
             if listener.failure:
                 raise HandPoseError(f'the node does not start: {listener.failure}')
             replay = Replay(bag, topics={bag.depth_topic, *infos}, reliability='reliable')
+
+            def answered() -> bool:
+                return len(listener.answers) >= replay.published[bag.depth_topic]
+
             try:
                 replay.wait_for_subscribers(START_TIMEOUT_S, 2 + len(infos))  # node and listener; camera_info: node
-                answered = lambda: len(listener.answers) >= replay.published[bag.depth_topic]  # noqa: E731
                 replay.play(ready=answered if patient else None)
                 listener.wait_until_quiet()  # the last image goes with its publisher, if it is still on the way
             finally:

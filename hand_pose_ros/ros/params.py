@@ -178,13 +178,12 @@ def changed(params: Params, changes: Sequence[Parameter], *, configured: bool) -
         HandPoseError: the change is refused; the message is the reason.
     """
     rows = {ros_name(row): row for row in fields(Params)}
-    ours = {rows[change.name].name: change.value for change in changes if change.name in rows}
-    for row in fields(Params):
-        if configured and row.metadata['fixed'] == _CONFIGURED and ours.get(row.name, getattr(params, row.name)) != \
-                getattr(params, row.name):
+    ours = [(rows[change.name], change.value) for change in changes if change.name in rows]
+    for row, value in ours:
+        if configured and row.metadata['fixed'] == _CONFIGURED and value != getattr(params, row.name):
             raise HandPoseError(f'parameter {ros_name(row)} is read when the node is configured: deactivate and clean '
                                 'up the node first, then set it and configure again')
-    return replace(params, **ours)
+    return replace(params, **{row.name: value for row, value in ours})
 
 
 def _descriptor(row: Any) -> ParameterDescriptor:

@@ -89,7 +89,7 @@ def _view_bag(args: argparse.Namespace) -> int:
             for image in from_bag(bag):
                 try:
                     depth, intrinsics = image.load()
-                    hands = estimator(depth, intrinsics, time_s=image.stamp_ns / 1e9)
+                    hands = estimator(depth, intrinsics)
                 except InputError as error:
                     failed += 1
                     print(f'hand-pose view: {error}', file=sys.stderr)

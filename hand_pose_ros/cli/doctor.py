@@ -35,7 +35,6 @@ VGA_IMAGE = 640 * 480 * 2
 ENOUGH_SHARED_MEMORY = 64 << 20
 """Bytes; every process with the profile for large images takes a segment of 16 MB."""
 
-
 Findings = Iterator[tuple[Literal['ok', 'note', 'WRONG'], str]]
 """What a check has to say, a line each."""
 

@@ -1,4 +1,4 @@
-"""hand-pose experiment: repeat an experiment of the paper."""
+"""`hand-pose experiment`: repeat an experiment of the paper."""
 
 from __future__ import annotations
 
@@ -40,6 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    """Train what is missing, test, write the results and print the table."""
     from tqdm.contrib.logging import logging_redirect_tqdm
 
     from hand_pose_ros.cli.train import machine, show_progress

@@ -1,4 +1,4 @@
-"""hand-pose train: train a network from a recipe."""
+"""`hand-pose train`: train a network from a recipe."""
 
 from __future__ import annotations
 
@@ -66,6 +66,11 @@ def show_progress() -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    """Train, or go on, and name the best weights.
+
+    Raises:
+        HandPoseError: the recipe is none, or there is a run already, or none to go on with.
+    """
     from tqdm.contrib.logging import logging_redirect_tqdm
 
     from hand_pose_ros.training.distributed import process_group

@@ -56,9 +56,9 @@ def subscribe(node: Node, message_type: type, topic: str, callback: Callable[...
 
 
 def subscribe_latched(node: Node, message_type: type, topic: str, callback: Callable[..., None]) -> Subscription | None:
-    """Listen, too, to what was said once, where all publishers keep it for whoever comes later (transient local).
+    """Listen, too, to what was said once and is kept for whoever comes later; None if there is nobody to listen to.
 
-    Others would be told, and tell their user, that somebody wants of them what they do not offer.
+    Only where all publishers are transient local: others would log an incompatible QoS.
     """
     infos = node.get_publishers_info_by_topic(topic)
     if not infos or any(info.qos_profile.durability != qos.LATCHED.durability for info in infos):

@@ -96,8 +96,8 @@ def measure(rate: float, seconds: float, reliability: str, parameters: list[str]
     from rclpy.qos import QoSProfile, ReliabilityPolicy
     from sensor_msgs.msg import CameraInfo, Image
 
+    from hand_pose_ros.conventions import stamp_ns
     from hand_pose_ros.msg import HandJointsArray
-    from hand_pose_ros.ros.conversions import stamp_ns
 
     sent: dict[int, float] = {}
     received: dict[int, float] = {}

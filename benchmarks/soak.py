@@ -30,10 +30,10 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, Image
 from tqdm import tqdm
 
+from hand_pose_ros.conventions import stamp_ns
 from hand_pose_ros.files import write_json
 from hand_pose_ros.msg import HandJointsArray
 from hand_pose_ros.ros import qos
-from hand_pose_ros.ros.conversions import stamp_ns
 
 PATIENCE_S = 1.0
 """An image that is not answered within this time counts as lost."""

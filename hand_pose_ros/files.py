@@ -16,7 +16,7 @@ from hand_pose_ros.errors import InputError
 def in_one_step(path: str | Path) -> Iterator[Path]:
     """A file beside `path` to write to, which becomes `path` when the block ends; after an error nothing is left.
 
-    A link stays one, and its target is replaced. What is no file but takes one (/dev/stdout, a FIFO) is written to.
+    A link stays one, and its target is replaced. A device or FIFO (/dev/stdout) is written to directly.
 
     Raises:
         InputError: the folder cannot be made or written.

@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
-from launch.actions import DeclareLaunchArgument
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from launch import LaunchDescription
+from launch import LaunchContext, LaunchDescription
 
 SHARE = Path(__file__).resolve().parents[1]
 
@@ -18,19 +18,27 @@ def generate_launch_description() -> LaunchDescription:
         'depth_topic': ('depth/image_rect', 'Depth image, without its transport; camera_info is beside it.'),
         'params_file': (str(SHARE / 'config' / 'estimator.yaml'), 'Parameters of the node.'),
         'namespace': ('', 'Namespace of the node and its topics.'),
-        'use_sim_time': ('false', 'Take the time from /clock (bags played with --clock); params_file is not asked.'),
+        'use_sim_time': ('', 'true: take the time from /clock (bags played with --clock). Empty: as params_file says.'),
         'rviz': ('false', 'Show the hands in RViz.'),
     }
     return LaunchDescription([
         *(DeclareLaunchArgument(name, default_value=value, description=about)
           for name, (value, about) in arguments.items()),
+        OpaqueFunction(function=_nodes),
+    ])
+
+
+def _nodes(context: LaunchContext) -> list[Node]:
+    """A parameter that is passed on beats params_file, so use_sim_time is passed on only if it was given."""
+    use_sim_time = LaunchConfiguration('use_sim_time')
+    given = [{'use_sim_time': use_sim_time}] if use_sim_time.perform(context) else []
+    return [
         Node(package='hand_pose_ros', executable='estimator', name='estimator', output='screen',
              namespace=LaunchConfiguration('namespace'),
-             parameters=[LaunchConfiguration('params_file'), {'use_sim_time': LaunchConfiguration('use_sim_time')}],
+             parameters=[LaunchConfiguration('params_file'), *given],
              remappings=[('depth/image_rect', LaunchConfiguration('depth_topic'))]),
         Node(package='rviz2', executable='rviz2', arguments=['-d', str(SHARE / 'rviz' / 'hand_pose.rviz')],
              namespace=LaunchConfiguration('namespace'),
              remappings=[('/hand/markers', 'hand/markers'), ('/depth/image_rect', LaunchConfiguration('depth_topic'))],
-             parameters=[{'use_sim_time': LaunchConfiguration('use_sim_time')}],
-             condition=IfCondition(LaunchConfiguration('rviz'))),
-    ])
+             parameters=given, condition=IfCondition(LaunchConfiguration('rviz'))),
+    ]

@@ -13,7 +13,7 @@ from hand_pose_ros.bags import Bag, BagWriter, DepthBag, read_hands
 from hand_pose_ros.bags.bag import typestore
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.geometry import Cube, Intrinsics
-from hand_pose_ros.skeleton import HAND21
+from hand_pose_ros.skeleton import HAND21, Skeleton
 
 CAMERA = Intrinsics(300.5, 301.5, 31.5, 23.5, 64, 48)
 STAMPS = [1_700_000_000_123_456_789 + i * 33_000_000 for i in range(12)]
@@ -271,6 +271,22 @@ def test_hands_come_back_as_written(tmp_path):
             np.testing.assert_array_equal(record.confidence[i], h.confidence)
     with pytest.raises(InputError, match='named /other, but the bag has /hand/joints'):
         read_hands(tmp_path / 'hands.mcap', topic='/other')
+
+
+@pytest.mark.parametrize('skeleton', [HAND21, Skeleton('paw', ('toe',), (-1,))])
+def test_hands_without_all_their_joints_are_refused(tmp_path, skeleton):
+    whole, part = hand(1), hand(1)
+    part.joints, part.confidence = part.joints[:20], part.confidence[:20]
+    for name, hands in (('part', [part]), ('both', [whole, part])):
+        with BagWriter(tmp_path / f'{name}.mcap') as bag:
+            bag.write_hands(STAMPS[0], 'camera', hands, skeleton)
+    with pytest.raises(InputError, match=fr'joints and confidences, but all must have 21 \({skeleton.name}\)'):
+        read_hands(tmp_path / 'both.mcap')
+    if skeleton == HAND21:
+        with pytest.raises(InputError, match=r'part.mcap: /hand/joints: .* have \[20\] joints'):
+            read_hands(tmp_path / 'part.mcap')
+    else:  # how many an unknown one has is not known
+        assert read_hands(tmp_path / 'part.mcap')[0].joints.shape == (1, 20, 3)
 
 
 def test_the_skeleton_is_recorded_latched(tmp_path):

@@ -35,6 +35,7 @@ def test_the_list_of_verbs_is_complete(capsys):
 
 @pytest.mark.parametrize('arguments', [[], ['no_such_verb'], ['--no-such-option', 'doctor'], ['estimate'],
                                        ['train', 'modern', '--out', 'x', '--workers', '-1'],
+                                       ['synth', 'show', 'x.png', '--split', 'val', '--start', '-1'],
                                        ['estimate', 'x', '--no-such-option']])
 def test_bad_arguments_are_exit_code_2(arguments, capsys):
     with pytest.raises(SystemExit) as exit_:

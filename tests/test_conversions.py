@@ -15,6 +15,7 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
 from hand_pose_ros import markers as markers_module
+from hand_pose_ros.conventions import stamp_ns
 from hand_pose_ros.depth import depth_problem
 from hand_pose_ros.drawing import FINGER_COLORS
 from hand_pose_ros.errors import HandPoseError, InputError
@@ -23,7 +24,7 @@ from hand_pose_ros.geometry import Cube, Intrinsics
 from hand_pose_ros.markers import HandMarkers
 from hand_pose_ros.resources import resource
 from hand_pose_ros.ros.camera import Camera
-from hand_pose_ros.ros.conversions import hand_from_msg, hands_to_msg, markers_to_msg, skeleton_to_msg, stamp_ns
+from hand_pose_ros.ros.conversions import hand_from_msg, hands_to_msg, markers_to_msg, skeleton_to_msg
 from hand_pose_ros.ros.diagnostics import Statistics
 from hand_pose_ros.ros.params import Params, markdown_table, yaml_file
 from hand_pose_ros.skeleton import HAND21
@@ -178,12 +179,15 @@ def test_the_rviz_file_shows_the_markers() -> None:
     assert topics == ['/hand/markers']
 
 
-def test_the_launch_file_starts_the_node_with_its_parameter_file(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize('use_sim_time', ['', 'true'])
+def test_the_launch_file_starts_the_node_with_its_parameter_file(use_sim_time: str,
+                                                                 monkeypatch: pytest.MonkeyPatch) -> None:
     """With stand-ins for launch, which has no wheels: what the file passes to it is what is tested."""
     import sys
     from types import ModuleType
 
     calls: list[tuple[str, tuple, dict]] = []
+    used: set[str] = set()
 
     def stand_in(module: str, *names: str) -> None:
         made = ModuleType(module)
@@ -194,10 +198,20 @@ def test_the_launch_file_starts_the_node_with_its_parameter_file(monkeypatch: py
             setattr(made, name, call)
         monkeypatch.setitem(sys.modules, module, made)
 
-    stand_in('launch', 'LaunchDescription')
-    stand_in('launch.actions', 'DeclareLaunchArgument')
+    class LaunchConfiguration(str):
+        """Its value in a context, which is a dictionary here."""
+
+        def __init__(self, name: str) -> None:
+            used.add(name)
+
+        def perform(self, context: dict[str, str]) -> str:
+            return context[self]
+
+    stand_in('launch', 'LaunchContext', 'LaunchDescription')
+    stand_in('launch.actions', 'DeclareLaunchArgument', 'OpaqueFunction')
     stand_in('launch.conditions', 'IfCondition')
-    stand_in('launch.substitutions', 'LaunchConfiguration')
+    stand_in('launch.substitutions')
+    sys.modules['launch.substitutions'].LaunchConfiguration = LaunchConfiguration
     stand_in('launch_ros', 'actions')
     stand_in('launch_ros.actions', 'Node')
     path = resource('launch/estimator.launch.py')
@@ -205,12 +219,17 @@ def test_the_launch_file_starts_the_node_with_its_parameter_file(monkeypatch: py
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     module.generate_launch_description()
+    [function] = (kwargs['function'] for name, _, kwargs in calls if name == 'OpaqueFunction')
+    function({'use_sim_time': use_sim_time})
 
     declared = {args[0]: kwargs for name, args, kwargs in calls if name == 'DeclareLaunchArgument'}
-    used = {args[0] for name, args, _ in calls if name == 'LaunchConfiguration'}
     assert used == set(declared) and all(kwargs['description'] for kwargs in declared.values())
+    assert declared['use_sim_time']['default_value'] == ''
     node, rviz = (kwargs for name, _, kwargs in calls if name == 'Node')
     assert (node['package'], node['executable'], node['name']) == ('hand_pose_ros', 'estimator', 'estimator')
+    given = [{'use_sim_time': 'use_sim_time'}] if use_sim_time else []  # else it would beat the file
+    assert (node['parameters'], rviz['parameters']) == (['params_file', *given], given)
+    assert (node['namespace'], node['remappings']) == ('namespace', [('depth/image_rect', 'depth_topic')])
     assert resource('config/estimator.yaml').samefile(declared['params_file']['default_value'])
     assert resource('rviz/hand_pose.rviz').samefile(rviz['arguments'][1])
 

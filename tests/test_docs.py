@@ -82,9 +82,9 @@ COMMANDS = commands()
 def test_commands_have_the_options_that_pages_give_them(line: str) -> None:
     verb, *arguments = COMMANDS[line]
     assert verb in VERBS
-    verbs = ArgumentParser().add_subparsers()
-    importlib.import_module(f'hand_pose_ros.cli.{verb}').add_parser(verbs)
-    verbs.choices[verb].parse_args(arguments)  # exits if it does not know one
+    parser = ArgumentParser()
+    importlib.import_module(f'hand_pose_ros.cli.{verb}').add_arguments(parser)
+    parser.parse_args(arguments)  # exits if it does not know one
 
 
 def test_the_pages_have_commands() -> None:

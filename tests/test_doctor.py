@@ -1,6 +1,7 @@
 """`hand-pose doctor` says what is there, and what is wrong, whatever state the installation is in."""
 
 import importlib
+import re
 import sys
 from pathlib import Path
 
@@ -84,6 +85,12 @@ def test_a_library_that_cannot_be_imported(weights: Path, monkeypatch: pytest.Mo
     monkeypatch.setitem(sys.modules, 'rosbags', None)
     code, about = report(capsys)
     assert code == 1 and 'rosbags cannot be imported' in about['libraries'][0] and 'numpy' in about['libraries'][1]
+
+
+def test_every_dependency_is_examined() -> None:
+    text = (Path(__file__).parents[1] / 'pyproject.toml').read_text()
+    names = re.findall(r'"([\w-]+)', text[text.index('\ndependencies = ['):text.index('[project.optional')])
+    assert {{'opencv-python-headless': 'cv2'}.get(name, name) for name in names} == set(doctor.LIBRARIES)
 
 
 def test_profiles_of_the_middleware(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

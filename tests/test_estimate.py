@@ -102,6 +102,15 @@ def test_a_folder_of_pngs_into_arrays_and_pictures(tmp_path, folder, command, ex
     assert f'wrote {tmp_path / "joints.npz"} and {tmp_path / "pictures"}' in said
 
 
+def test_names_of_pngs_may_be_in_capitals_and_hold_any_digit(tmp_path, folder, command):
+    (capitals := tmp_path / 'capitals').mkdir()
+    for name in ('9', '10', '²1'):
+        (capitals / f'{name}.PNG').write_bytes((folder / '9.png').read_bytes())
+    for given, names in ((capitals, ['9', '10', '²1']), (capitals / '9.PNG', ['9'])):
+        assert command(given, *INTRINSICS, '--out', tmp_path / 'joints.npz') == 0
+        assert np.load(tmp_path / 'joints.npz')['names'].tolist() == names
+
+
 def test_a_bag_into_a_bag(tmp_path, bag, command, expected):
     assert command(bag, '--out', tmp_path / 'joints.mcap') == 0
     recorded = read_hands(tmp_path / 'joints.mcap')

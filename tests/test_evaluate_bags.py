@@ -331,6 +331,15 @@ def test_the_live_node_answers_what_the_estimator_says(ros_domain, tmp_path, mod
     assert 0 < got['latency_ms']['image to joints']['p50'] < 2000
 
 
+def test_the_default_weights_have_one_name_with_and_without_the_node(tmp_path, bag, monkeypatch):
+    pytest.importorskip('rclpy', reason='ROS is not installed')
+    from hand_pose_ros.ros.live import Answers
+    monkeypatch.setattr('hand_pose_ros.ros.live.play_through_node', lambda *_: Answers('hand21', {}, {}))
+    for more in ((), ('--via-ros',)):
+        assert main(['evaluate', str(bag), '--device', 'cpu', '--json', str(tmp_path / 'r.json'), *more]) == 0
+        assert json.loads((tmp_path / 'r.json').read_text())['model'] == 'hand_dense'
+
+
 def test_bags_of_one_name_get_names_of_their_own():
     bags = ['x.mcap', '../x.mcap', 'a/b/x.mcap', 'a_b/x.mcap', 'y.mcap']
     names = _names(bags)

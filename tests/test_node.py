@@ -473,6 +473,17 @@ def test_an_image_waits_for_the_camera_info_that_comes_after_it(rig: Rig) -> Non
     assert (first.x, first.y, first.z) == pytest.approx((second.x, second.y, second.z), abs=0.2)
 
 
+def test_to_stop_while_an_image_waits_for_its_camera_info_is_no_complaint(rig: Rig) -> None:
+    rig.start(camera_info_timeout=9.0)
+    publish = rig.camera(RELIABLE)
+    publish(image(depth_with_hand()))
+    rig.until(lambda: rig.node._camera._changed._waiters, 'the image to wait')
+    assert rig.transition('deactivate') and rig.transition('activate')
+    rig.until(lambda: sum('listening to' in text for text in rig.said()) == 2, 'to hear all that was said before')
+    assert not any('camera_info arrived' in text for text in rig.said())
+    assert rig.answer(rig.camera(info=camera_info()), image(depth_with_hand())).hands
+
+
 def no_data(message: Image) -> None:
     message.data = array('B')
 
@@ -573,6 +584,14 @@ def test_silence_names_the_topic_and_its_publishers(rig: Rig, monkeypatch: pytes
     rig.until(lambda: reports and '/somewhere' in reports[-1].status[0].message
               and reports[-1].status[0].level == b'\x03', 'staleness')
     assert sum('/somewhere/else' in text for text in rig.said()) == 1
+
+
+def test_depth_that_is_only_raw_is_found(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(node_module, 'SILENCE_S', 0.1)
+    rig.client.create_publisher(Image, 'depth/image_rect', RELIABLE)
+    rig.start(transport='compressedDepth')
+    rig.until_said('no image arrived on /depth/image_rect/compressedDepth',
+                   'depth is published on /depth/image_rect: set the parameter transport to raw')
 
 
 @pytest.mark.parametrize('transport', ['compressedDepth', 'compressed'])

@@ -12,7 +12,7 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
 
 import rclpy
-from geometry_msgs.msg import PoseArray, TransformStamped
+from geometry_msgs.msg import Point, PoseArray, TransformStamped
 from sensor_msgs.msg import Image, JointState, RegionOfInterest
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool
@@ -38,7 +38,7 @@ from hand_pose_ros.estimator import HandEstimate
 from hand_pose_ros.geometry import Cube, Intrinsics, crop
 from hand_pose_ros.models import build
 from hand_pose_ros.models.checkpoints import save_checkpoint
-from hand_pose_ros.msg import HandJointsArray
+from hand_pose_ros.msg import HandJoints, HandJointsArray
 from hand_pose_ros.ros.conversions import (
     hands_to_msg,
     in_frame,
@@ -282,7 +282,7 @@ def test_two_hands_keep_their_ids_whichever_is_nearer(rig: Rig) -> None:
     assert len(back) == 2 and back[0].id == names[0][0] and back[1].id not in names[0]
 
 
-def test_hands_in_another_frame_are_not_shown_live():
+def test_hands_that_do_not_fit_are_not_shown_live():
     rclpy.init()
     try:
         shown, said = [], []
@@ -292,6 +292,8 @@ def test_hands_in_another_frame_are_not_shown_live():
         watcher._image(picture)
         message = HandJointsArray(header=picture.header, skeleton='hand21')
         watcher._hands(message)
+        message.hands = [HandJoints(joints=[Point()] * 20, confidence=[1.0] * 20, cube_size=0.3)]
+        watcher._hands(message)
         message.header.frame_id = 'base_link'
         watcher._hands(message)
         message.skeleton = 'paw'
@@ -300,4 +302,5 @@ def test_hands_in_another_frame_are_not_shown_live():
     finally:
         rclpy.try_shutdown()
     assert len(shown) == 1
+    assert 'a hand has 20 joints and 20 confidences, but hand21 has 21' in said[-3]
     assert "in frame 'base_link', but the images in" in said[-2] and 'paw' in said[-1]

@@ -180,6 +180,24 @@ def test_compare_prints_tables_and_intervals(result, tmp_path, capsys):
     assert 'b - a: -' in capsys.readouterr().out
 
 
+def test_what_is_compared_is_not_written_over(result, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for name in ('a.npz', 'x=1.npz'):
+        result.save(name)
+    before = (tmp_path / 'a.npz').read_bytes()
+    assert main(['compare', 'x=1.npz', 'old=a.npz', '--json', 'a.npz']) == 1
+    assert main(['compare', 'x=1.npz', 'old=a.npz', '--json', str(tmp_path)]) == 1
+    assert main(['evaluate', 'bag.mcap', '--out', 'x=1.npz', '--compare', 'old=x=1.npz']) == 1
+    kept, folder, kept_too = capsys.readouterr().err.splitlines()
+    assert 'a.npz: this is the input, which would be lost' in kept and 'is a folder' in folder
+    assert 'x=1.npz: this is the input, which would be lost' in kept_too
+    assert before == (tmp_path / 'a.npz').read_bytes() == (tmp_path / 'x=1.npz').read_bytes()
+    assert main(['compare', 'x=1.npz', 'old=a.npz', '--json', 'c.json']) == 0
+    assert [one['name'] for one in json.loads((tmp_path / 'c.json').read_text())['results']] == [result.name, 'old']
+    assert main(['compare', 'x=1.npz', 'a.npz']) == 0
+    assert 'a - x=1: +0.000 mm' in capsys.readouterr().out
+
+
 def test_compare_refuses_what_cannot_be_compared(result, tmp_path, capsys):
     result.save(tmp_path / 'a.npz')
     Result('short', HAND21, CAMERA, result.predictions[:9], result.truth[:9]).save(tmp_path / 'short.npz')

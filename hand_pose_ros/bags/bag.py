@@ -111,7 +111,10 @@ def _open(path: Path) -> tuple[AnyReader, bool]:
     attempts: list[Any] = [path]
     files = [file for kind in ('mcap', 'db3') for file in path.glob(f'*.{kind}')] if path.is_dir() else [path]
     if len(files) == 1:
-        attempts += [files[0]] * path.is_dir() + [_InterruptedMcap(files[0])] * (files[0].suffix == '.mcap')
+        if path.is_dir():
+            attempts.append(files[0])
+        if files[0].suffix == '.mcap':
+            attempts.append(_InterruptedMcap(files[0]))
     failure: Exception | None = None
     for attempt in attempts:
         try:

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from rosbags.interfaces import Connection
 
 from hand_pose_ros.bags.bag import CAMERA_INFO, COMPRESSED_IMAGE, HANDS, IMAGE, SIDES, Bag
+from hand_pose_ros.conventions import TRANSPORTS, camera_info_beside, join_transport, split_transport, stamp_ns
 from hand_pose_ros.depth import DEPTH_ENCODINGS, decode_compressed, decode_image
 from hand_pose_ros.errors import InputError, naming
 from hand_pose_ros.geometry import Intrinsics
-
-_TRANSPORTS = ('compressedDepth', 'compressed')
+from hand_pose_ros.skeleton import SKELETONS
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class DepthBag(Bag):
             self._images = self._on_topic(self.depth_topic, (IMAGE, COMPRESSED_IMAGE), 'another depth topic')
             self._infos: list[Connection] = []
             if intrinsics is None:
-                beside = f'{_image_topic(self.depth_topic).rpartition("/")[0]}/camera_info'
+                beside = camera_info_beside(split_transport(self.depth_topic)[0])
                 self._infos = self._on_topic(camera_info_topic or beside, (CAMERA_INFO,),
                                              'the topic of the camera_info (--camera-info-topic), or the '
                                              'intrinsics (--intrinsics FX FY CX CY)')
@@ -104,8 +104,9 @@ class DepthBag(Bag):
         count = 0
         try:
             for connection in self._infos:  # an image that was recorded before its camera_info takes the first one
-                infos = (self.deserialize(connection, data) for _, _, data in self.messages([connection]))
-                any(self._remember(connection, info, cameras) for info in infos)
+                for _, _, data in self.messages([connection]):
+                    if self._remember(connection, self.deserialize(connection, data), cameras):
+                        break
             for connection, _, data in self.messages([*self._images, *self._infos]):
                 message = self.deserialize(connection, data)
                 if connection.msgtype == CAMERA_INFO:
@@ -115,7 +116,7 @@ class DepthBag(Bag):
                 if not cameras and not self._intrinsics:
                     raise InputError(self._unusable)
                 camera = self._intrinsics if not cameras else cameras.get(header.frame_id, cameras[''])
-                yield Frame(_stamp_ns(header), header.frame_id, self.depth_topic, message, camera, self._depth_scale)
+                yield Frame(stamp_ns(header), header.frame_id, self.depth_topic, message, camera, self._depth_scale)
                 count += 1
         except InputError as error:
             raise InputError(f'{error} ({count} of {len(self)} depth images were read)') from error
@@ -135,9 +136,9 @@ class DepthBag(Bag):
         depth = {connection.topic for connection in self.connections if self._carries_depth(connection)}
         # The transports of one image are one candidate, and the raw one needs the least work; compressed ones may have
         # lost something.
-        images = {_image_topic(topic) for topic in depth}
-        ways = {image: (image, *(f'{image}/{transport}' for transport in _TRANSPORTS)) for image in images}
-        topics = sorted(next(topic for topic in ways[image] if topic in depth) for image in images)
+        images = {split_transport(topic)[0] for topic in depth}
+        ways = ([join_transport(image, transport) for transport in TRANSPORTS] for image in images)
+        topics = sorted(next(topic for topic in way if topic in depth) for way in ways)
         if len(topics) == 1:
             return topics[0]
         if topics:
@@ -225,28 +226,20 @@ def check_frame(source: str, hands: str, images: str) -> None:
 
 def _recorded_hands(message: Any, source: str) -> RecordedHands:
     counts = {count for hand in message.hands for count in (len(hand.joints), len(hand.confidence))}
-    if len(counts) > 1:
-        raise InputError(f'{source}: the hands of one message have {sorted(counts)} joints and confidences: '
-                         'they must be as many as the skeleton has')
-    shape = (len(message.hands), max(counts, default=0))
+    known = SKELETONS.get(message.skeleton)
+    count = len(known) if known else max(counts, default=0)
+    if counts - {count}:
+        raise InputError(f'{source}: the hands of one message have {sorted(counts)} joints and confidences, but all '
+                         f'must have {count} ({message.skeleton}): record as many, or name another skeleton')
+    shape = (len(message.hands), count)
     joints = [[(point.x, point.y, point.z) for point in hand.joints] for hand in message.hands]
     return RecordedHands(
-        _stamp_ns(message.header), message.header.frame_id, message.skeleton,
+        stamp_ns(message.header), message.header.frame_id, message.skeleton,
         np.array(joints, np.float64).reshape(*shape, 3),
         np.array([hand.confidence for hand in message.hands], np.float32).reshape(shape),
         np.array([hand.score for hand in message.hands], np.float32),
         tuple(SIDES[hand.side] if hand.side < len(SIDES) else 'unknown' for hand in message.hands),
         tuple(hand.id for hand in message.hands))
-
-
-def _stamp_ns(header: Any) -> int:
-    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
-
-
-def _image_topic(topic: str) -> str:
-    """The topic without its transport: /depth/image/compressedDepth -> /depth/image."""
-    base, _, last = topic.rpartition('/')
-    return base if last in _TRANSPORTS else topic
 
 
 def _ros_name(msgtype: str) -> str:

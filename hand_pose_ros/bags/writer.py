@@ -15,6 +15,7 @@ from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLi
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from hand_pose_ros.bags.bag import CAMERA_INFO, COMPRESSED_IMAGE, HAND, HANDS, IMAGE, SIDES, SKELETON, typestore
+from hand_pose_ros.conventions import camera_info_beside, join_transport
 from hand_pose_ros.depth import encode_compressed, to_units
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.geometry import Intrinsics
@@ -79,27 +80,26 @@ class BagWriter:
         self._writer.write(self._connections[topic], stamp_ns, data)
 
     def write_depth(self, stamp_ns: int, frame_id: str, depth: NDArray[np.float32], intrinsics: Intrinsics, *,
-                    topic: str = '/depth/image_rect', codec: str | None = 'png', depth_scale: float = 0.001) -> None:
-        """Write a depth image as 16UC1, and its camera_info beside it.
+                    topic: str = '/depth/image_rect', codec: str | None = 'png') -> None:
+        """Write a depth image as 16UC1, in millimetres, and its camera_info beside it.
 
         Args:
             depth: (H, W) metres, 0 = no reading.
             topic: of the raw image; with a codec, `/compressedDepth` is added.
             codec: 'png' or 'rvl' for compressedDepth, None for raw images.
-            depth_scale: metres per unit.
         """
         header = self._header(stamp_ns, frame_id)
         info = self._camera_info(header, intrinsics)
-        self.write(f'{topic.rpartition("/")[0]}/camera_info', CAMERA_INFO, info, stamp_ns)
+        self.write(camera_info_beside(topic), CAMERA_INFO, info, stamp_ns)
         if codec is None:
-            units = to_units(depth, depth_scale).astype('<u2')
+            units = to_units(depth).astype('<u2')
             height, width = units.shape
             self.write(topic, IMAGE, self._types[IMAGE](
                 header=header, height=height, width=width, encoding='16UC1', is_bigendian=0, step=2 * width,
                 data=units.view(np.uint8).ravel()), stamp_ns)
         else:
-            name, data = encode_compressed(depth, codec, depth_scale)
-            self.write(f'{topic}/compressedDepth', COMPRESSED_IMAGE, self._types[COMPRESSED_IMAGE](
+            name, data = encode_compressed(depth, codec)
+            self.write(join_transport(topic, 'compressedDepth'), COMPRESSED_IMAGE, self._types[COMPRESSED_IMAGE](
                 header=header, format=name, data=np.frombuffer(data, np.uint8)), stamp_ns)
 
     def write_hands(self, stamp_ns: int, frame_id: str, hands: Sequence[HandEstimate], skeleton: Skeleton = HAND21,
@@ -109,19 +109,18 @@ class BagWriter:
             header=self._header(stamp_ns, frame_id), skeleton=skeleton.name,
             hands=[self._hand(hand) for hand in hands]), stamp_ns)
 
-    def write_skeleton(self, stamp_ns: int, frame_id: str, skeleton: Skeleton, model: str, model_version: str,
-                       topic: str = '/hand/skeleton') -> None:
-        """Write what the joints mean (HandSkeleton), latched; once."""
-        self.write(topic, SKELETON, self._types[SKELETON](
+    def write_skeleton(self, stamp_ns: int, frame_id: str, skeleton: Skeleton, model: str, model_version: str) -> None:
+        """Write what the joints mean (HandSkeleton) on /hand/skeleton, latched; once."""
+        self.write('/hand/skeleton', SKELETON, self._types[SKELETON](
             header=self._header(stamp_ns, frame_id), name=skeleton.name, joint_names=list(skeleton.joint_names),
             parents=np.array(skeleton.parents, np.int8), model=model, model_version=model_version),
             stamp_ns, latched=True)
 
-    def write_markers(self, stamp_ns: int, frame_id: str, markers: Sequence[Marker],
-                      topic: str = '/hand/markers') -> None:
-        """Write a MarkerArray (see `hand_pose_ros.markers`); players show it until it is deleted."""
+    def write_markers(self, stamp_ns: int, frame_id: str, markers: Sequence[Marker]) -> None:
+        """Write a MarkerArray on /hand/markers (see `hand_pose_ros.markers`); players show it until it is deleted."""
         header = self._header(stamp_ns, frame_id)
-        self.write(topic, MARKERS, self._types[MARKERS](markers=[self._marker(header, m) for m in markers]), stamp_ns)
+        message = self._types[MARKERS](markers=[self._marker(header, marker) for marker in markers])
+        self.write('/hand/markers', MARKERS, message, stamp_ns)
 
     def close(self) -> None:
         """Complete the bag and move it into place."""

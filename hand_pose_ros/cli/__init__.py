@@ -1,6 +1,7 @@
 """The `hand-pose` command: one file per verb, imported only when it is asked for.
 
-A verb is a module with `add_parser(subparsers)` and `run(args) -> int`. Exit codes: 0 done, 1 failed, 2 bad arguments.
+A verb is a module with DESCRIPTION, EXAMPLES, `add_arguments(parser)` and `run(args) -> int`; `args.parser` is that
+parser. Exit codes: 0 done, 1 failed, 2 bad arguments.
 """
 
 from __future__ import annotations
@@ -49,17 +50,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     module = None
     # Only the verb that was asked for is imported: torch, matplotlib and ROS are slow to load.
     for verb, summary in VERBS.items():
-        if argv and argv[0] == verb:
+        subparser = subparsers.add_parser(verb, help=summary, formatter_class=argparse.RawDescriptionHelpFormatter)
+        subparser.set_defaults(parser=subparser)
+        if argv[:1] == [verb]:
             module = importlib.import_module(f'hand_pose_ros.cli.{verb}')
-            module.add_parser(subparsers)
-        else:
-            subparsers.add_parser(verb, help=summary)
+            subparser.description, subparser.epilog = module.DESCRIPTION, module.EXAMPLES
+            module.add_arguments(subparser)
     args, unknown = parser.parse_known_args(argv)
     if module is None:
         parser.error('the verb comes first')
     if unknown:
         hint = f'; {module.HINT}' if hasattr(module, 'HINT') else ''
-        subparsers.choices[args.verb].error(f'unrecognized arguments: {" ".join(unknown)}{hint}')
+        args.parser.error(f'unrecognized arguments: {" ".join(unknown)}{hint}')
     try:
         return module.run(args)
     except HandPoseError as error:

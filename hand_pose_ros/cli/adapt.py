@@ -19,7 +19,10 @@ if TYPE_CHECKING:
     from hand_pose_ros.runtime import Engine
     from hand_pose_ros.training.adapt import Look, Numbers
 
-_EXAMPLES = """examples:
+DESCRIPTION = ('Fine-tune a network to your camera, from a bag without labels, and compare it with the original '
+               'on images that it did not learn from. Needs no ROS and no GPU; takes some minutes.')
+
+EXAMPLES = """examples:
   hand-pose adapt my_hand.mcap --out my_camera.safetensors
   hand-pose adapt old.bag --depth-topic /camera/depth/image_raw --side left --out my_camera.safetensors
   hand-pose adapt labelled.mcap --ground-truth /truth/joints --out my_camera.safetensors
@@ -37,13 +40,8 @@ ROWS = {'found': ('images with a hand, %', 100.0), 'error_mm': ('mean error, mm'
         'bone_drift_mm': ('bone drift, mm', 1.0), 'explained': ('depth explained, %', 100.0)}
 
 
-def add_parser(subparsers: Any) -> None:
-    """Declare the verb."""
-    parser = subparsers.add_parser(
-        'adapt', help='fine-tune a network to your camera, from a bag without labels',
-        description='Fine-tune a network to your camera, from a bag without labels, and compare it with the original '
-                    'on images that it did not learn from. Needs no ROS and no GPU; takes some minutes.',
-        epilog=_EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what the verb takes."""
     parser.add_argument('bag', metavar='BAG', type=Path, help='one moving hand (ROS 1, sqlite3, MCAP)')
     parser.add_argument('--out', type=Path, required=True, metavar='FILE', help='the new weights, .safetensors')
     parser.add_argument('--model', help='weights to start from: a name or a checkpoint (the default weights)')
@@ -53,7 +51,6 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('--ground-truth', metavar='G', help='only for the comparison: a topic of the bag with '
                         'HandJointsArray, or an .npz file as for `hand-pose evaluate`')
     add_bag(parser)
-    parser.set_defaults(parser=parser)
 
 
 def run(args: argparse.Namespace) -> int:

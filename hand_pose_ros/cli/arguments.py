@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 from hand_pose_ros.errors import HandPoseError, naming
+from hand_pose_ros.files import check_writable
 from hand_pose_ros.geometry import Intrinsics
 
 
@@ -51,6 +52,15 @@ def keep_input(output: str | Path | None, source: str | Path | None) -> None:
     inside = Path(source).resolve() == Path(output).resolve().parent
     if Path(output).samefile(source) or (inside and Path(output).suffix in ('.mcap', '.db3', '.yaml')):
         raise HandPoseError(f'{output}: this is the input, which would be lost: choose another place')
+
+
+def check_outputs(outputs: Iterable[str | Path | None], sources: Sequence[str | Path | None]) -> None:
+    """Raise HandPoseError, before minutes of work, if an output would replace a source or cannot be written."""
+    for output in outputs:
+        for source in sources:
+            keep_input(output, source)
+        if output:
+            check_writable(output)
 
 
 def refuse(args: argparse.Namespace, names: Iterable[str], why: str) -> None:

@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from hand_pose_ros.estimator import HandPoseEstimator
     from hand_pose_ros.runtime.engine import Pipeline
 
-_EXAMPLES = """examples:
+DESCRIPTION = 'Measure how fast this machine runs networks, refinement, every stage and whole frames.'
+
+EXAMPLES = """examples:
   hand-pose bench
   hand-pose bench --json speed.json --threads 1
   hand-pose bench --model my.safetensors --quick
@@ -33,12 +35,8 @@ _CALLS = 10
 """Calls of one row before it is the turn of the next."""
 
 
-def add_parser(subparsers: Any) -> None:
-    """Declare the verb."""
-    parser = subparsers.add_parser(
-        'bench', help='measure speed on this machine', epilog=_EXAMPLES,
-        description='Measure how fast this machine runs networks, refinement, every stage and whole frames.',
-        formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what the verb takes."""
     parser.add_argument('--json', type=Path, metavar='FILE', help='write the rows there too')
     parser.add_argument('--model', help='whole frames with these weights, too, by name or path')
     parser.add_argument('--threads', type=count, metavar='N', help='threads for the networks (chosen by the cores)')

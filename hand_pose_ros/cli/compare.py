@@ -7,17 +7,18 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from hand_pose_ros.cli.arguments import count
+from hand_pose_ros.cli.arguments import check_outputs, count
 from hand_pose_ros.cli.evaluate import print_summaries
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.evaluation import metrics
-from hand_pose_ros.evaluation.published import DATASETS, load_result
+from hand_pose_ros.evaluation.published import DATASETS, load_result, split_source
 from hand_pose_ros.evaluation.results import Result, told_notes
 from hand_pose_ros.files import write_json
+
+DESCRIPTION = 'Tables and curves of any number of results, and confidence intervals of their differences.'
 
 EXAMPLES = """examples:
   hand-pose compare a.npz b.npz --out plots
@@ -29,13 +30,8 @@ hold 0 is more than chance on these frames.
 """
 
 
-def add_parser(subparsers: Any) -> None:
-    """Add this verb to the command line."""
-    parser = subparsers.add_parser(
-        'compare', help='several results side by side', epilog=EXAMPLES,
-        description='Tables and curves of any number of results, and confidence intervals of their differences.',
-        formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.set_defaults(error=parser.error)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what the verb takes."""
     parser.add_argument('results', nargs='+', metavar='[NAME=]FILE',
                         help='.npz of `hand-pose evaluate --out`, or predictions as text')
     parser.add_argument('--ground-truth', metavar='G', help='labels of the predictions that are text')
@@ -49,7 +45,9 @@ def add_parser(subparsers: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Compare, print, and write what was asked for."""
     if len(args.results) < 2:
-        args.error('give at least two results')
+        args.parser.error('give at least two results')
+    check_outputs((args.json, args.out and Path(args.out) / 'report.html'),
+                  (args.ground_truth, *(split_source(source)[1] for source in args.results)))
     dataset = DATASETS[args.dataset] if args.dataset else None
     results = _named_apart([load_result(source, args.ground_truth, dataset) for source in args.results], args.results)
     for note in told_notes(results):
@@ -83,8 +81,9 @@ def run(args: argparse.Namespace) -> int:
 def _named_apart(results: Sequence[Result], sources: Sequence[str]) -> list[Result]:
     """The same results; those of one bag, which have its name, with the names of their files."""
     names = [result.name for result in results]
-    return [replace(result, name=Path(source).stem) if names.count(result.name) > 1 and '=' not in source else result
-            for result, source in zip(results, sources, strict=True)]
+    given, paths = zip(*map(split_source, sources), strict=True)
+    return [replace(result, name=Path(path).stem) if names.count(result.name) > 1 and not name else result
+            for result, name, path in zip(results, given, paths, strict=True)]
 
 
 def _not_paired(a: Result, b: Result) -> str:

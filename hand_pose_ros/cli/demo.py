@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -25,6 +25,8 @@ TRUTH_TOPIC = '/truth/joints'
 SHEET_PICTURES = 12
 ANIMATION_HEIGHT = 320
 
+DESCRIPTION = 'Play a bag through the real node in another process, and show what comes out.'
+
 EXAMPLES = """examples:
   hand-pose demo
   hand-pose demo --out /tmp/demo
@@ -35,12 +37,8 @@ image was answered. The bag that ships shows a synthetic hand, as a simulated ca
 """
 
 
-def add_parser(subparsers: Any) -> None:
-    """Add this verb to the command line."""
-    parser = subparsers.add_parser(
-        'demo', help='play the bag that ships through the live node and show what comes out',
-        description='Play a bag through the real node in another process, and show what comes out.', epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what the verb takes."""
     parser.add_argument('--out', type=Path, default=Path('demo_output'), metavar='FOLDER', help='(demo_output)')
     parser.add_argument('--bag', type=Path, help='another bag than the one that ships; its truth, if it has any, is '
                         f'a HandJointsArray on {TRUTH_TOPIC}')

@@ -12,11 +12,13 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 from xml.etree import ElementTree
 
 from hand_pose_ros import __version__
 from hand_pose_ros.errors import HandPoseError
+
+DESCRIPTION = 'Say what is installed here, whether it works, and what to do where it does not.'
 
 EXAMPLES = """examples:
   hand-pose doctor
@@ -24,7 +26,8 @@ EXAMPLES = """examples:
 
 Each line begins with ok, note (worth knowing) or WRONG (with what to do). The exit code is 1 if anything is WRONG.
 """
-LIBRARIES = ('numpy', 'cv2', 'torch', 'safetensors', 'onnx', 'onnxruntime', 'rosbags', 'scipy', 'matplotlib', 'tqdm')
+LIBRARIES = ('numpy', 'cv2', 'torch', 'safetensors', 'onnx', 'onnxruntime', 'rosbags', 'scipy', 'matplotlib', 'tqdm',
+             'filelock')
 SHARED_MEMORY = Path('/dev/shm')
 DEFAULT_SEGMENT = 512 * 1024
 """Bytes of the shared-memory segment of Fast DDS where no profile says otherwise."""
@@ -32,16 +35,12 @@ VGA_IMAGE = 640 * 480 * 2
 ENOUGH_SHARED_MEMORY = 64 << 20
 """Bytes; every process with the profile for large images takes a segment of 16 MB."""
 
-
 Findings = Iterator[tuple[Literal['ok', 'note', 'WRONG'], str]]
 """What a check has to say, a line each."""
 
 
-def add_parser(subparsers: Any) -> None:
-    """Add this verb to the command line."""
-    subparsers.add_parser('doctor', help='what is installed, whether it works, and what to do where it does not',
-                          description='Say what is installed here, whether it works, and what to do where it does not.',
-                          epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what the verb takes."""
 
 
 def run(args: argparse.Namespace) -> int:

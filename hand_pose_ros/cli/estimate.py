@@ -39,7 +39,9 @@ from hand_pose_ros.skeleton import Skeleton
 if TYPE_CHECKING:
     from hand_pose_ros.estimator import HandPoseEstimator
 
-_EXAMPLES = """examples:
+DESCRIPTION = 'The joints of every depth image of a bag or a folder, as numbers, as a bag and as pictures.'
+
+EXAMPLES = """examples:
   hand-pose estimate recording.mcap --out joints.npz --overlay pictures
   hand-pose estimate old.bag --depth-topic /camera/depth/image_raw --out joints.mcap
   hand-pose estimate frames/ --intrinsics 363.9 363.9 255.4 206.3 --overlay pictures
@@ -52,12 +54,8 @@ cube_center, cube_side; and once: names and stamp_ns of the images, joint_names,
 _PNG_PERIOD_NS = 33_333_333
 
 
-def add_parser(subparsers: Any) -> None:
-    """Declare the verb."""
-    parser = subparsers.add_parser(
-        'estimate', help='joints and pictures from a bag or from 16-bit depth PNGs',
-        description='The joints of every depth image of a bag or a folder, as numbers, as a bag and as pictures.',
-        epilog=_EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what the verb takes."""
     parser.add_argument('input', metavar='INPUT', type=Path, help='a bag (ROS 1, sqlite3, MCAP), a 16-bit depth PNG, '
                         'or a folder of them')
     add_bag(parser)
@@ -65,7 +63,6 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('--max-hands', type=count, default=2, metavar='N', help='at most N hands per image (2)')
     parser.add_argument('--out', type=Path, metavar='FILE', help='.npz or .mcap')
     parser.add_argument('--overlay', type=Path, metavar='FOLDER', help='a picture of every image with its joints')
-    parser.set_defaults(parser=parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -151,10 +148,10 @@ def estimate(images: Iterator[DepthInput], count: int, estimator: HandPoseEstima
 
 def _open(args: argparse.Namespace, stack: ExitStack) -> tuple[Iterator[DepthInput], int]:
     """The images of the input, and how many there are."""
-    is_png = args.input.suffix.lower() == '.png'
-    paths = [args.input] if is_png else sorted(args.input.glob('*.png'), key=_natural) if args.input.is_dir() else []
+    candidates = list(args.input.iterdir()) if args.input.is_dir() else [args.input]
+    paths = sorted((path for path in candidates if path.suffix.lower() == '.png'), key=_natural)
     if args.input.is_dir() and not paths and not any(
-            path.suffix in ('.mcap', '.db3', '.yaml') for path in args.input.iterdir()):
+            path.suffix in ('.mcap', '.db3', '.yaml') for path in candidates):
         raise InputError(f'{args.input}: the folder holds neither 16-bit depth .png files nor a bag')
     if paths:
         if args.intrinsics is None:
@@ -191,7 +188,7 @@ def from_bag(bag: DepthBag) -> Iterator[DepthInput]:
 
 def _natural(path: Path) -> list[Any]:
     """Sorts 30.png before 110.png."""
-    return [int(part) if part.isdigit() else part for part in re.split(r'(\d+)', path.name)]
+    return [int(part) if part.isdecimal() else part for part in re.split(r'(\d+)', path.name)]
 
 
 class _Overlays:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
+
+DESCRIPTION = 'Run the ROS 2 node until Ctrl-C.'
 
 EXAMPLES = """examples:
   hand-pose estimator
@@ -17,10 +18,8 @@ Depth images come in on depth/image_rect, with depth/camera_info; joints go out 
 HINT = 'parameters are set with --ros-args -p NAME:=VALUE; --parameters lists them'
 
 
-def add_parser(subparsers: Any) -> None:
-    """Add this verb to the command line."""
-    parser = subparsers.add_parser('estimator', help='the ROS 2 node', formatter_class=argparse.RawTextHelpFormatter,
-                                   description='Run the ROS 2 node until Ctrl-C.', epilog=EXAMPLES)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what the verb takes."""
     parser.add_argument('--ros-args', nargs=argparse.REMAINDER, default=[], metavar='...',
                         help='remappings (-r from:=to) and parameters (-p name:=value), as for ros2 run')
     parser.add_argument('--parameters', action='store_true', help='print the table of parameters and leave')

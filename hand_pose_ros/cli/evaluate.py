@@ -19,6 +19,7 @@ from hand_pose_ros.cli.arguments import (
     add_bag,
     add_estimator,
     bag_options,
+    check_outputs,
     count,
     estimator_options,
     keep_input,
@@ -28,10 +29,13 @@ from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.evaluation import published
 from hand_pose_ros.evaluation.results import Result, told_notes
 from hand_pose_ros.evaluation.tables import ACCURACY_COLUMNS, accuracy_rows, number, text_table
-from hand_pose_ros.files import check_writable, write_json
+from hand_pose_ros.files import write_json
 
 if TYPE_CHECKING:
     from hand_pose_ros.evaluation.bag_evaluation import Settings
+
+DESCRIPTION = ('Score predictions in a text file against labels, or run the estimator over bags and score it, or '
+               'only time it if there is no ground truth.')
 
 EXAMPLES = """examples:
   hand-pose evaluate --predictions NYU.txt.gz --ground-truth labels.txt.gz --dataset nyu --report out
@@ -47,13 +51,8 @@ or not.
 """
 
 
-def add_parser(subparsers: Any) -> None:
-    """Add this verb to the command line."""
-    parser = subparsers.add_parser(
-        'evaluate', help='score a prediction file, or the estimator on a bag', epilog=EXAMPLES,
-        description='Score predictions in a text file against labels, or run the estimator over bags and score it, or '
-                    'only time it if there is no ground truth.', formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.set_defaults(parser=parser)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what the verb takes."""
     parser.add_argument('bags', nargs='*', metavar='BAG', help='a ROS 1 file, a ROS 2 folder, '
                         'or an .mcap or .db3 file; or '
                         'synthetic-test-v1, the benchmark, which is made on the spot; or nyu, icvl, msra or msra:P1 to '
@@ -94,11 +93,9 @@ def run(args: argparse.Namespace) -> int:
     if args.out and len(args.bags) < 2 and Path(args.out).suffix != '.npz':
         args.parser.error(f'--out {args.out}: the result is an .npz file')
     out = Path(args.out) / 'any.npz' if args.out and len(args.bags) > 1 else args.out
-    for path in filter(None, (args.json, out, args.report and Path(args.report) / 'report.html')):
-        for source in (*args.bags, args.ground_truth, args.predictions,
-                       *(compared.rpartition('=')[2] for compared in args.compare)):
-            keep_input(path, source)
-        check_writable(path)  # now, not after minutes of work
+    compared = [published.split_source(source)[1] for source in args.compare]
+    check_outputs((args.json, out, args.report and Path(args.report) / 'report.html'),
+                  (*args.bags, args.ground_truth, args.predictions, *compared))
     if args.predictions:
         refuse(args, (*ESTIMATOR, 'depth_topic', 'camera_info_topic', 'depth_scale', 'out_bag', 'via_ros', 'jobs',
                       'root', 'split'), 'is for bags and recorded datasets: these joints are estimated already')
@@ -121,7 +118,7 @@ def run(args: argparse.Namespace) -> int:
         else:
             from hand_pose_ros.evaluation.benchmark_evaluation import evaluate_benchmark
             result = evaluate_benchmark(args.model, args.device, progress=_progress('batches'))
-        _deliver(args, result, others, None)
+        _deliver(result, others, None, args.json, args.out, args.report)
         return 0
     return _run_bag(args) if len(args.bags) == 1 else _run_bags(args)
 
@@ -147,7 +144,7 @@ def _run_text(args: argparse.Namespace) -> int:
                          f'{args.predictions} is unknown')
     others = [published.load_result(source, args.ground_truth, dataset) for source in args.compare]
     read_depths = partial(tompson.read_nyu_depths, args.depth_folder) if args.depth_folder else None
-    _deliver(args, result, others, read_depths)
+    _deliver(result, others, read_depths, args.json, args.out, args.report)
     return 0
 
 
@@ -161,7 +158,8 @@ def _run_bag(args: argparse.Namespace) -> int:
     sink = partial(HandBag, args.out_bag) if args.out_bag else None
     result = _evaluate_live(args, settings) if args.via_ros else \
         evaluate_bag(args.bags[0], settings, _progress('frames'), sink)
-    _deliver(args, result, others, lambda rows: read_depths(args.bags[0], rows, settings))
+    depths = partial(read_depths, args.bags[0], settings=settings)
+    _deliver(result, others, depths, args.json, args.out, args.report)
     return int(result.info['damaged'])
 
 
@@ -171,7 +169,7 @@ def _evaluate_live(args: argparse.Namespace, settings: Settings) -> Result:
         args.parser.error('--out-bag does not work with --via-ros: record /hand/joints instead')
     from hand_pose_ros.bags import DepthBag
     from hand_pose_ros.evaluation.ground_truth import read_truth, with_truth
-    from hand_pose_ros.models.checkpoints import load_checkpoint
+    from hand_pose_ros.models.checkpoints import DEFAULT, load_checkpoint
     from hand_pose_ros.ros.live import play_through_node
     from hand_pose_ros.skeleton import get_skeleton
 
@@ -199,7 +197,7 @@ def _evaluate_live(args: argparse.Namespace, settings: Settings) -> Result:
     result = Result(
         Path(args.bags[0]).stem, skeleton, first.intrinsics, joints, stamps_ns=np.array(stamps),
         seconds={'image to joints': latency}, notes=notes if dropped else (), info={
-            'bag': args.bags[0], 'depth_topic': topic, 'model': args.model or 'default', 'device': args.device,
+            'bag': args.bags[0], 'depth_topic': topic, 'model': args.model or DEFAULT, 'device': args.device,
             'via_ros': True, 'dropped': dropped, 'damaged': False})
     return with_truth(result, truth, first.frame_id) if truth else result
 
@@ -225,10 +223,9 @@ def _run_bags(args: argparse.Namespace) -> int:
                     continue
                 result = replace(outcome, name=names[str(bag)])
                 summaries[str(bag)] = result.summary()
-                single = argparse.Namespace(
-                    json=None, report=args.report and Path(args.report) / result.name,
-                    out=args.out and Path(args.out) / f'{result.name}.npz')
-                _deliver(single, result, [], lambda rows, bag=bag: read_depths(bag, rows, settings))  # type: ignore[misc]
+                _deliver(result, [], partial(read_depths, bag, settings=settings),
+                         out=args.out and Path(args.out) / f'{result.name}.npz',
+                         report=args.report and Path(args.report) / result.name)
     finally:  # after Ctrl-C, too
         if args.json and summaries:
             write_json(args.json, {'bags': {bag: summaries[bag] for bag in args.bags if bag in summaries}})
@@ -256,22 +253,22 @@ def _names(bags: Sequence[str]) -> dict[str, str]:
     return names
 
 
-def _deliver(args: argparse.Namespace, result: Result, others: Sequence[Result],
-             read_depths: Callable[[Sequence[int]], dict[int, Any]] | None) -> None:
+def _deliver(result: Result, others: Sequence[Result], read_depths: Callable[[Sequence[int]], dict[int, Any]] | None,
+             json: str | None = None, out: str | Path | None = None, report: str | Path | None = None) -> None:
     """Print the numbers, and write the files that were asked for."""
     for note in told_notes([result, *others]):
         print(f'NOTE: {note}', file=sys.stderr)
     summary = result.summary()
     print_summaries([(result.name, summary), *((other.name, other.summary()) for other in others)])
-    if args.json:
-        write_json(args.json, summary)
-    if args.out:
-        result.save(args.out)
-    if args.report:
+    if json:
+        write_json(json, summary)
+    if out:
+        result.save(out)
+    if report:
         from hand_pose_ros.evaluation.report import write_report
         if any(other.skeleton != result.skeleton for other in others):
             raise InputError(f'--compare: all results must have the joints of {result.skeleton.name}')
-        print(f'report: {write_report([result, *others], args.report, read_depths)}')
+        print(f'report: {write_report([result, *others], report, read_depths)}')
 
 
 def print_summaries(summaries: Iterable[tuple[str, dict[str, Any]]]) -> None:
@@ -283,10 +280,12 @@ def print_summaries(summaries: Iterable[tuple[str, dict[str, Any]]]) -> None:
     for name, summary in summaries:
         if 'latency_ms' not in summary:
             continue
-        print(f'{name}: {summary["frames_total"]} frames, {number(summary["detection_rate"], 1, " %", 100)} with a '
-              f'hand, {_pace(summary)}' + ('' if 'mean_mm' in summary else  # which is in the table
-              f', jitter {number(summary["jitter_mm"], 2, " mm")}, '
-              f'bone drift {number(summary["bone_drift_mm"], 2, " mm")}'))
+        line = (f'{name}: {summary["frames_total"]} frames, {number(summary["detection_rate"], 1, " %", 100)} with a '
+                f'hand, {_pace(summary)}')
+        if 'mean_mm' not in summary:  # else the table says more
+            line += (f', jitter {number(summary["jitter_mm"], 2, " mm")}, '
+                     f'bone drift {number(summary["bone_drift_mm"], 2, " mm")}')
+        print(line)
         keys = ('mean', 'p50', 'p90', 'p99', 'max')
         print(text_table(('ms', *keys), [(stage, *(number(row.get(key), 3) for key in keys))
                                          for stage, row in summary['latency_ms'].items()]))

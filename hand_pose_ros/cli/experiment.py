@@ -1,12 +1,15 @@
-"""hand-pose experiment: repeat an experiment of the paper."""
+"""`hand-pose experiment`: repeat an experiment of the paper."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
-EPILOG = """experiments:
+DESCRIPTION = """\
+Repeat an experiment of the paper: train the networks that it needs, test them, and write tables and plots.
+This may take hours; after Ctrl-C, the same command goes on."""
+
+EXAMPLES = """experiments:
   networks      Shallow, Deep and Multi-Scale, each direct and with a bottleneck of 8 and 30, and DeepPrior++
   bottleneck    width of the bottleneck against direct regression
   refinement    none, StdRef and ORRef, and the number of iterations
@@ -26,14 +29,10 @@ examples:
 NAMES = ('networks', 'bottleneck', 'refinement', 'joints', 'runtime', 'qualitative', 'ingredients')
 
 
-def add_parser(subparsers: Any) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what the verb takes."""
     from hand_pose_ros.cli.train import add_machine_arguments
 
-    parser = subparsers.add_parser(
-        'experiment', help='repeat an experiment of the paper', epilog=EPILOG,
-        description='Repeat an experiment of the paper: train the networks that it needs, test them, and write tables '
-                    'and plots.\nThis may take hours; after Ctrl-C, the same command goes on.',
-        formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('name', choices=NAMES, metavar='NAME', help='see below')
     parser.add_argument('--out', type=Path, required=True, metavar='OUT', help='folder of results and trained networks')
     parser.add_argument('--recipe', default='paper', help='what all networks are trained by (default: %(default)s)')
@@ -41,6 +40,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    """Train what is missing, test, write the results and print the table."""
     from tqdm.contrib.logging import logging_redirect_tqdm
 
     from hand_pose_ros.cli.train import machine, show_progress

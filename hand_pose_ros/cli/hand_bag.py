@@ -47,9 +47,8 @@ class HandBag:
     def add(self, image: Stamped, hands: Sequence[HandEstimate]) -> None:
         """Write the hands of an image, none included."""
         if not self._begun:
-            about = self._metadata
-            self._writer.write_skeleton(image.stamp_ns, image.frame_id, self._skeleton,
-                                        str(about.get('name', about['architecture'])), str(about['version']))
+            from hand_pose_ros.models.checkpoints import described  # imports torch: not for --help
+            self._writer.write_skeleton(image.stamp_ns, image.frame_id, self._skeleton, *described(self._metadata))
             self._begun = True
         self._writer.write_hands(image.stamp_ns, image.frame_id, hands, self._skeleton)
         self._writer.write_markers(image.stamp_ns, image.frame_id, self._markers.update(hands))

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
-_EXAMPLES = """examples:
+DESCRIPTION = 'Publish a bag (ROS 1, sqlite3, MCAP) on ROS 2 topics, with its recorded types and stamps.'
+
+EXAMPLES = """examples:
   hand-pose replay recording.mcap
   hand-pose replay old_ros1.bag --rate 0.5 --loop
   hand-pose replay recording.mcap --clock --start 12.5 --topics /depth/image_rect /depth/camera_info
@@ -16,14 +17,12 @@ _EXAMPLES = """examples:
 While it plays, pause and go on with
   ros2 service call /replay/pause std_srvs/srv/SetBool "{data: true}"     (or false)
 """
+_ENDLESS = 1e9
+"""Beyond it nanoseconds do not fit into the times of messages."""
 
 
-def add_parser(subparsers: Any) -> None:
-    """Declare the verb."""
-    parser = subparsers.add_parser(
-        'replay', help='publish a bag on ROS topics', epilog=_EXAMPLES,
-        description='Publish a bag (ROS 1, sqlite3, MCAP) on ROS 2 topics, with its recorded types and stamps.',
-        formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what the verb takes."""
     parser.add_argument('bag', metavar='BAG', type=Path, help='a .bag, .mcap or .db3 file, or a ROS 2 folder')
     parser.add_argument('--topics', nargs='+', metavar='TOPIC', help='publish these only')
     parser.add_argument('--rate', type=float, default=1.0, metavar='X', help='times the recorded speed (1)')
@@ -37,7 +36,6 @@ def add_parser(subparsers: Any) -> None:
                         help='seconds for subscribers to find the topics before the first message; they may need 3 (4)')
     parser.add_argument('--ros-args', nargs=argparse.REMAINDER, default=[], metavar='...',
                         help='remappings (-r from:=to) and so on, as with ros2 run')
-    parser.set_defaults(parser=parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -46,10 +44,10 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         HandPoseError: there is no ROS, or the bag cannot be read.
     """
-    if not args.rate > 0:
-        args.parser.error(f'--rate {args.rate}: must be more than 0')
-    if not args.start >= 0:
-        args.parser.error(f'--start {args.start}: must not be negative')
+    if not 0 < args.rate <= _ENDLESS:
+        args.parser.error(f'--rate {args.rate:g}: must be more than 0, and finite')
+    if not 0 <= args.start <= _ENDLESS:
+        args.parser.error(f'--start {args.start:g}: must be 0 or more, and finite')
     from hand_pose_ros.ros.replay import replaying  # says what is missing where there is no ROS
 
     with replaying(args.bag, args.ros_args, topics=args.topics, rate=args.rate, reliability=args.qos, clock=args.clock,

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hand_pose_ros.cli.arguments import count
+from hand_pose_ros.cli.arguments import count, none_or_more
 from hand_pose_ros.errors import HandPoseError
 
 if TYPE_CHECKING:
@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from hand_pose_ros.drawing import Picture
     from hand_pose_ros.synthetic.generator import SyntheticHands
 
-_EXAMPLES = """examples:
+DESCRIPTION = 'Hands of many shapes in many poses, seen by simulated depth sensors, as networks are trained on.'
+
+EXAMPLES = """examples:
   hand-pose synth show hands.png --joints
   hand-pose synth show sensors.png --per-sensor --number 8
   hand-pose synth show both.png --sensors kinect2 --real frames/kinect2 363.9 363.9 255.4 206.3 0.001
@@ -30,16 +32,12 @@ _COLUMNS = 8
 _ZOOM = 2
 
 
-def add_parser(subparsers: Any) -> None:
-    """Declare the verb."""
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what the verb takes."""
     from hand_pose_ros.synthetic.sensors import SENSORS  # imports torch, as all that this verb does
-    parser = subparsers.add_parser(
-        'synth', help='make or show synthetic depth hands', epilog=_EXAMPLES,
-        description='Hands of many shapes in many poses, seen by simulated depth sensors, as networks are trained on.',
-        formatter_class=argparse.RawDescriptionHelpFormatter)
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument('--split', default='train', choices=('train', 'val', 'test'), help='(train)')
-    common.add_argument('--start', type=int, default=0, metavar='I', help='index of the first sample (0)')
+    common.add_argument('--start', type=none_or_more, default=0, metavar='I', help='index of the first sample (0)')
     common.add_argument('--sensors', nargs='+', metavar='NAME',
                         help=f'of {", ".join(sensor.name for sensor in SENSORS)} (all)')
     common.add_argument('--rig', type=Path, metavar='GLB', help="another skin: a glTF hand with WebXR's joint names")
@@ -69,7 +67,6 @@ def add_parser(subparsers: Any) -> None:
 
     stats = actions.add_parser('stats', parents=[common, real], help='numbers of synthetic beside real crops')
     stats.add_argument('--number', type=count, default=512, metavar='N', help='synthetic samples (512)')
-    parser.set_defaults(parser=parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -199,7 +196,7 @@ def _record(args: argparse.Namespace) -> None:
             truth = HandEstimate(joints, HAND21.joint_names, np.ones(len(HAND21), np.float32), 1.0, side,
                                  Cube((float(middle[0]), float(middle[1]), float(middle[2])), 0.3), 'truth')
             bag.write_depth(stamp, frame, depth, camera, codec=None if args.raw else 'png')
-            bag.write_hands(stamp, frame, [truth] if side != 'none' else [], topic='/truth/joints')
+            bag.write_hands(stamp, frame, [truth], topic='/truth/joints')
     print(f'{args.out}: {args.number} images')
 
 

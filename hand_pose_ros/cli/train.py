@@ -1,4 +1,4 @@
-"""hand-pose train: train a network from a recipe."""
+"""`hand-pose train`: train a network from a recipe."""
 
 from __future__ import annotations
 
@@ -8,7 +8,11 @@ from typing import Any
 
 from hand_pose_ros.cli.arguments import count, none_or_more
 
-EPILOG = """examples:
+DESCRIPTION = """\
+Train a network from a recipe, on synthetic hands or a recorded dataset. This may take hours: Ctrl-C stops
+after the current step and leaves weights to use, and --resume goes on from there."""
+
+EXAMPLES = """examples:
   hand-pose train modern --out runs/modern
   hand-pose train paper --out runs/deep-prior --set samples=1_000_000 --set augmentation=modern
   hand-pose train paper --out runs/direct --set network=shallow --set options.bottleneck=none
@@ -21,18 +25,13 @@ recipes: paper, original-code, modern, finder. docs/training.md says what they d
 """
 
 
-def add_parser(subparsers: Any) -> None:
-    parser = subparsers.add_parser(
-        'train', help='train a network from a recipe', epilog=EPILOG,
-        description='Train a network from a recipe, on synthetic hands or a recorded dataset. This may take hours: '
-                    'Ctrl-C stops\nafter the current step and leaves weights to use, and --resume goes on from there.',
-        formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what the verb takes."""
     parser.add_argument('recipe', nargs='?',
                         help='paper, original-code, modern or finder (with --resume: that of the run)')
     parser.add_argument('--out', type=Path, required=True, metavar='RUN', help='folder of the run')
     parser.add_argument('--resume', action='store_true', help='continue the run in RUN')
     add_machine_arguments(parser)
-    parser.set_defaults(parser=parser)
 
 
 def add_machine_arguments(parser: argparse.ArgumentParser) -> None:
@@ -67,6 +66,11 @@ def show_progress() -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    """Train, or go on, and name the best weights.
+
+    Raises:
+        HandPoseError: the recipe is none, or there is a run already, or none to go on with.
+    """
     from tqdm.contrib.logging import logging_redirect_tqdm
 
     from hand_pose_ros.training.distributed import process_group

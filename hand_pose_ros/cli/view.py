@@ -26,6 +26,7 @@ from hand_pose_ros.cli.arguments import (
     refuse,
 )
 from hand_pose_ros.cli.estimate import from_bag
+from hand_pose_ros.conventions import TRANSPORTS
 from hand_pose_ros.depth import to_units
 from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.files import in_one_step
@@ -34,7 +35,9 @@ from hand_pose_ros.hand import HandEstimate
 from hand_pose_ros.markers import DELETE, SPHERE_LIST, HandMarkers, Marker
 from hand_pose_ros.skeleton import Skeleton
 
-_EXAMPLES = """examples:
+DESCRIPTION = 'Show depth images and hands in 3D with Rerun: those of a bag, or of live topics.'
+
+EXAMPLES = """examples:
   hand-pose view recording.mcap
   hand-pose view recording.mcap --save recording.rrd     (open it later, or elsewhere, with: rerun recording.rrd)
   hand-pose view --ros-args -r depth/image_rect:=/camera/camera/depth/image_rect_raw
@@ -43,13 +46,8 @@ Without a bag it shows what a camera and the node `estimator` publish, until Ctr
 """
 
 
-def add_parser(subparsers: Any) -> None:
-    """Declare the verb."""
-    parser = subparsers.add_parser(
-        'view', help='depth images and hands in 3D, live or from a bag', epilog=_EXAMPLES,
-        description='Show depth images and hands in 3D with Rerun: those of a bag, or of live topics.',
-        formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.set_defaults(parser=parser)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what the verb takes."""
     parser.add_argument('bag', metavar='BAG', type=Path, nargs='?', help='a .bag, .mcap or .db3 file, or a ROS 2 '
                         'folder: its hands are estimated; without it, live topics are shown')
     parser.add_argument('--save', metavar='FILE', type=Path, help='write an .rrd file instead of opening the viewer')
@@ -58,8 +56,7 @@ def add_parser(subparsers: Any) -> None:
     add_estimator(bag)
     bag.add_argument('--max-hands', type=count, default=2, metavar='N', help='at most N hands per image (2)')
     live = parser.add_argument_group('live')
-    live.add_argument('--transport', default='raw', choices=('raw', 'compressedDepth', 'compressed'),
-                      help='of the depth images (raw)')
+    live.add_argument('--transport', default='raw', choices=TRANSPORTS, help='of the depth images (raw)')
     live.add_argument('--ros-args', nargs=argparse.REMAINDER, default=[], metavar='...',
                       help='remappings (-r from:=to) and so on, as with ros2 run')
 
@@ -92,7 +89,7 @@ def _view_bag(args: argparse.Namespace) -> int:
             for image in from_bag(bag):
                 try:
                     depth, intrinsics = image.load()
-                    hands = estimator(depth, intrinsics, time_s=image.stamp_ns / 1e9)
+                    hands = estimator(depth, intrinsics)
                 except InputError as error:
                     failed += 1
                     print(f'hand-pose view: {error}', file=sys.stderr)

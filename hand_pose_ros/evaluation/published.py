@@ -149,6 +149,12 @@ def load_published(predictions: str | Path, truth: str | Path, dataset: Dataset)
               'intrinsics': f'fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g}'})
 
 
+def split_source(source: str) -> tuple[str, str]:
+    """Name and path of `FILE` or `NAME=FILE`; the name is empty if none was given. A file's own name may hold a `=`."""
+    name, equals, path = source.partition('=')
+    return (name, path) if equals and not Path(source).exists() else ('', source)
+
+
 def load_result(source: str, truth: str | Path | None = None, dataset: Dataset | None = None) -> Result:
     """A result by `FILE` or `NAME=FILE`: an .npz file that `Result.save` wrote, or predictions as text.
 
@@ -158,7 +164,7 @@ def load_result(source: str, truth: str | Path | None = None, dataset: Dataset |
     Raises:
         InputError: the file cannot be used, or it is text and there is no truth to it.
     """
-    name, _, path = source.partition('=') if '=' in source and not Path(source).exists() else ('', '', source)
+    name, path = split_source(source)
     if Path(path).suffix == '.npz':
         result = Result.load(path)
     elif truth is None or dataset is None:

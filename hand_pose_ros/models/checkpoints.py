@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
@@ -55,17 +57,17 @@ def save_checkpoint(path: str | Path, network: nn.Module, metadata: dict[str, An
     path = Path(path)
     if missing := {'skeleton', 'cube_side'} - metadata.keys():
         raise CheckpointError(f"the metadata of checkpoint {path} lacks {', '.join(sorted(missing))}")
-    described = {**metadata, **_description(network), 'version': __version__}
+    metadata = {**metadata, **_description(network), 'version': __version__}
     tensors = _tensors('network', network, half)
     if refiner is not None:
-        described['refiner'] = _description(refiner)
+        metadata['refiner'] = _description(refiner)
         tensors |= _tensors('refiner', refiner, half)
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not tensor.isfinite().all():
             raise CheckpointError(f"checkpoint {path} is not written: '{name}' holds values that are "
                                   'not finite or too large for float16 (did training diverge?)')
     with in_one_step(path) as part:
-        save_file(tensors, part, metadata={'hand_pose_ros': json.dumps(described)})
+        save_file(tensors, part, metadata={'hand_pose_ros': json.dumps(metadata)})
 
 
 def load_checkpoint(name_or_path: str | PathLike[str] | None = None) -> Checkpoint:
@@ -88,6 +90,11 @@ def load_checkpoint(name_or_path: str | PathLike[str] | None = None) -> Checkpoi
             raise CheckpointError(f"checkpoint {path} predicts {joints} joints, "
                                   f"but its skeleton '{skeleton.name}' has {len(skeleton)}")
     return Checkpoint(network, refiner, metadata)
+
+
+def described(metadata: Mapping[str, Any]) -> tuple[str, str]:
+    """Name and version of a model, as HandSkeleton tells them."""
+    return str(metadata.get('name', metadata['architecture'])), str(metadata['version'])
 
 
 def _description(network: nn.Module) -> dict[str, Any]:
@@ -132,12 +139,15 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
                               'copy or download it again') from error
     try:
         metadata = json.loads(header['hand_pose_ros'])
-        missing = {'architecture', 'config', 'skeleton', 'cube_side'} - metadata.keys()
+        missing = {'architecture', 'config', 'skeleton', 'cube_side', 'version'} - metadata.keys()
     except (KeyError, ValueError, AttributeError) as error:
         raise CheckpointError(f'{path} was not written by hand_pose_ros: it does not say which network '
                               'its weights belong to') from error
     if missing:
         raise CheckpointError(f"checkpoint {path} does not say its {', '.join(sorted(missing))}")
+    if not (isinstance(metadata['cube_side'], int | float) and 0 < metadata['cube_side'] < math.inf):
+        raise CheckpointError(f"checkpoint {path}: its cube_side is {metadata['cube_side']!r:.80}, where metres "
+                              'belong: write it again with save_checkpoint')
     return metadata, tensors
 
 

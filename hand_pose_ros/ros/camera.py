@@ -11,6 +11,10 @@ from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.ros.params import Params
 
 
+class Closed(Exception):
+    """The waiting for a camera_info was ended."""
+
+
 class Camera:
     """Intrinsics from parameters or from the newest camera_info.
 
@@ -45,6 +49,7 @@ class Camera:
 
         Raises:
             InputError: there is none, it is not calibrated, it describes an image of another size, or no lens is so.
+            Closed: before there was one.
         """
         if params.has_intrinsics:
             given = params.intrinsics_fx, params.intrinsics_fy, params.intrinsics_cx, params.intrinsics_cy
@@ -54,9 +59,13 @@ class Camera:
             with naming('parameters intrinsics.*'):
                 intrinsics.check_lens()
             return intrinsics
+        def fits() -> bool:
+            return self._fits(width, height, params.use_rectified)
+
         with self._changed:
-            self._changed.wait_for(lambda: self._closed or self._fits(width, height, params.use_rectified),
-                                   params.camera_info_timeout)
+            self._changed.wait_for(lambda: self._closed or fits(), params.camera_info_timeout)
+            if self._closed and not fits():
+                raise Closed
             info = self._info
         if info is None:
             raise InputError(f'no camera_info arrived on {self.topic}: publish it beside the depth image, remap '

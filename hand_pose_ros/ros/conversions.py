@@ -17,6 +17,7 @@ from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from hand_pose_ros.angles import ANGLES, finger_angles
+from hand_pose_ros.errors import InputError
 from hand_pose_ros.estimator import HandEstimate, Side
 from hand_pose_ros.geometry import Cube
 from hand_pose_ros.markers import Color
@@ -26,11 +27,6 @@ from hand_pose_ros.skeleton import Skeleton
 
 SIDES: dict[Side, int] = {'unknown': HandJoints.UNKNOWN, 'left': HandJoints.LEFT, 'right': HandJoints.RIGHT}
 _SIDE_NAMES = {number: side for side, number in SIDES.items()}
-
-
-def stamp_ns(header: Header) -> int:
-    """The stamp of a header in nanoseconds."""
-    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
 
 
 def hands_to_msg(header: Header, hands: Sequence[HandEstimate], skeleton: Skeleton) -> HandJointsArray:
@@ -50,8 +46,12 @@ def hand_from_msg(message: HandJoints, skeleton: Skeleton) -> HandEstimate:
     """The inverse of `hand_to_msg`.
 
     Raises:
-        InputError: the cube of the message is none.
+        InputError: it has not the joints of the skeleton, or its cube is none.
     """
+    joints, confidences = len(message.joints), len(message.confidence)
+    if not joints == confidences == len(skeleton):
+        raise InputError(f'a hand has {joints} joints and {confidences} confidences, but {skeleton.name} has '
+                         f'{len(skeleton)}: publish as many, or name another skeleton')
     center = message.cube_center
     return HandEstimate(
         joints=np.array([(point.x, point.y, point.z) for point in message.joints], np.float32).reshape(-1, 3),

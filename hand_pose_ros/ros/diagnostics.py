@@ -113,7 +113,6 @@ class Statistics:
         return DiagnosticStatus(level=level, name=f'{node}: hand pose', message=message,
                                 values=[KeyValue(key=key, value=value) for key, value in values.items()])
 
-
     def _count_arrivals(self, counts: Counter[str]) -> None:
         """What arrived in one window or, of slow cameras, in several."""
         if not counts['camera_infos']:

@@ -62,7 +62,7 @@ class TargetFrame:
                              f'known ({error}): publish the transform, or leave target_frame empty') from error
 
     def clear(self) -> None:
-        """Forget transforms that move: a bag began again, and those of the times to come would be too old."""
+        """Forget moving transforms: time went back, and tf ignores what is older than what it has."""
         self._buffer.clear()
 
     def close(self) -> None:

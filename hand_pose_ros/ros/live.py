@@ -21,12 +21,12 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CompressedImage, Image
 
 from hand_pose_ros.bags import DepthBag
+from hand_pose_ros.conventions import camera_info_beside, split_transport, stamp_ns
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.msg import HandJointsArray, HandSkeleton
 from hand_pose_ros.ros import qos
-from hand_pose_ros.ros.conversions import stamp_ns
 from hand_pose_ros.ros.replay import Replay
-from hand_pose_ros.ros.topics import CAMERA_INFO, IMAGE, TRANSPORTS
+from hand_pose_ros.ros.topics import CAMERA_INFO, IMAGE
 
 START_TIMEOUT_S = 60.0
 """The node must be up after so long; loading the network takes most of it."""
@@ -64,14 +64,12 @@ def play_through_node(bag: DepthBag, camera_info_topic: str | None = None,
         InputError: the bag cannot be played.
     """
     namespace = f'/evaluation_{os.getpid()}'
-    base, _, transport = bag.depth_topic.rpartition('/')
-    image, transport = (base, transport) if transport in TRANSPORTS else (bag.depth_topic, 'raw')
-    beside = f'{image.rpartition("/")[0]}/camera_info'
-    infos = {camera_info_topic or beside} & {connection.topic for connection in bag.connections}
+    image, transport = split_transport(bag.depth_topic)
+    info = camera_info_topic or camera_info_beside(image)
+    infos = {info} & {connection.topic for connection in bag.connections}
     arguments = [item for name, value in {'transport': transport, **(parameters or {})}.items()
                  for item in ('-p', f'{name}:={value}')]
-    remappings = {'__ns': namespace, '/diagnostics': f'{namespace}/diagnostics', IMAGE: image,
-                  CAMERA_INFO: camera_info_topic or beside}
+    remappings = {'__ns': namespace, '/diagnostics': f'{namespace}/diagnostics', IMAGE: image, CAMERA_INFO: info}
     arguments += [item for name, topic in remappings.items() for item in ('-r', f'{name}:={topic}')]
     if ours := not rclpy.ok():
         qos.let_large_images_through()
@@ -83,9 +81,12 @@ def play_through_node(bag: DepthBag, camera_info_topic: str | None = None,
             if listener.failure:
                 raise HandPoseError(f'the node does not start: {listener.failure}')
             replay = Replay(bag, topics={bag.depth_topic, *infos}, reliability='reliable')
+
+            def answered() -> bool:
+                return len(listener.answers) >= replay.published[bag.depth_topic]
+
             try:
                 replay.wait_for_subscribers(START_TIMEOUT_S, 2 + len(infos))  # node and listener; camera_info: node
-                answered = lambda: len(listener.answers) >= replay.published[bag.depth_topic]  # noqa: E731
                 replay.play(ready=answered if patient else None)
                 listener.wait_until_quiet()  # the last image goes with its publisher, if it is still on the way
             finally:

@@ -27,6 +27,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
 from hand_pose_ros import ros
+from hand_pose_ros.conventions import stamp_ns
 from hand_pose_ros.depth import decode_compressed, decode_image, depth_problem
 from hand_pose_ros.detection import Region
 from hand_pose_ros.errors import HandPoseError
@@ -35,8 +36,7 @@ from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.models.checkpoints import DEFAULT
 from hand_pose_ros.ros import params as parameters
 from hand_pose_ros.ros import qos, topics
-from hand_pose_ros.ros.camera import Camera
-from hand_pose_ros.ros.conversions import stamp_ns
+from hand_pose_ros.ros.camera import Camera, Closed
 from hand_pose_ros.ros.diagnostics import Statistics
 from hand_pose_ros.ros.outputs import Outputs
 from hand_pose_ros.ros.worker import NewestWorker
@@ -285,6 +285,8 @@ class EstimatorNode(LifecycleNode):
                 self._statistics.count(answered=1, hands=len(hands))
             finally:  # the target frame may be unknown, but what is in that of the camera is not
                 self._outputs.publish_others(image.header, hands, depth, intrinsics, params)
+        except Closed:  # the node was stopped before a camera_info came
+            self._statistics.count(dropped=1)
         except HandPoseError as error:
             self._statistics.count(refused=1)
             self._complain(str(error))

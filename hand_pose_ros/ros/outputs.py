@@ -18,6 +18,7 @@ from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.estimator import HandEstimate, HandPoseEstimator
 from hand_pose_ros.geometry import Intrinsics, crop
 from hand_pose_ros.markers import HandMarkers
+from hand_pose_ros.models.checkpoints import described
 from hand_pose_ros.msg import HandJointsArray, HandSkeleton
 from hand_pose_ros.ros import conversions, qos
 from hand_pose_ros.ros.frames import TargetFrame, tf_message
@@ -57,9 +58,8 @@ class Outputs:
 
     def publish_skeleton(self) -> None:
         """Tell what the joints will mean."""
-        about, now = self._metadata, Header(stamp=self._node.get_clock().now().to_msg())
-        self._skeleton_pub.publish(conversions.skeleton_to_msg(
-            now, self._skeleton, str(about.get('name', about['architecture'])), str(about['version'])))
+        now = Header(stamp=self._node.get_clock().now().to_msg())
+        self._skeleton_pub.publish(conversions.skeleton_to_msg(now, self._skeleton, *described(self._metadata)))
 
     def publish_joints(self, header: Header, hands: Sequence[HandEstimate]) -> None:
         """Publish what others wait for: the joints, in the target frame if there is one.

@@ -14,6 +14,7 @@ from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from hand_pose_ros.conventions import TRANSPORTS
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.estimator import HandPoseEstimator
 
@@ -41,7 +42,7 @@ class Params:
                                   high=256, fixed=_CONFIGURED)
     transport: str = _parameter('raw', 'How depth arrives: raw takes the image topic itself, the others take '
                                 '<image topic>/<transport> (sensor_msgs/CompressedImage).',
-                                choices=('raw', 'compressedDepth', 'compressed'), fixed=_CONFIGURED)
+                                choices=TRANSPORTS, fixed=_CONFIGURED)
     depth_scale: float = _parameter(0.001, 'Metres per unit of 16-bit depth; 32FC1 is in metres already.',
                                     low=1e-5, high=1.0)
     use_rectified: bool = _parameter(True, 'Take the intrinsics from P of camera_info (rectified images) instead of K.')
@@ -177,13 +178,12 @@ def changed(params: Params, changes: Sequence[Parameter], *, configured: bool) -
         HandPoseError: the change is refused; the message is the reason.
     """
     rows = {ros_name(row): row for row in fields(Params)}
-    ours = {rows[change.name].name: change.value for change in changes if change.name in rows}
-    for row in fields(Params):
-        if configured and row.metadata['fixed'] == _CONFIGURED and ours.get(row.name, getattr(params, row.name)) != \
-                getattr(params, row.name):
+    ours = [(rows[change.name], change.value) for change in changes if change.name in rows]
+    for row, value in ours:
+        if configured and row.metadata['fixed'] == _CONFIGURED and value != getattr(params, row.name):
             raise HandPoseError(f'parameter {ros_name(row)} is read when the node is configured: deactivate and clean '
                                 'up the node first, then set it and configure again')
-    return replace(params, **ours)
+    return replace(params, **{row.name: value for row, value in ours})
 
 
 def _descriptor(row: Any) -> ParameterDescriptor:

@@ -57,7 +57,8 @@ def large_image_profile() -> tuple[str, str]:
     Only who publishes images needs it: the shared memory that an image must fit into is the publisher's. Without it a
     VGA depth image is larger than all of it, and most are lost on the way to a best-effort subscriber.
     """
-    name = PROFILE_VARIABLES[os.environ.get('ROS_DISTRO') in ('humble', 'iron', 'jazzy')]
+    new, old = PROFILE_VARIABLES
+    name = old if os.environ.get('ROS_DISTRO') in ('humble', 'iron', 'jazzy') else new
     return name, str(resource('config/fastdds_large_images.xml'))
 
 

@@ -29,8 +29,11 @@ from hand_pose_ros.errors import InputError
 from hand_pose_ros.ros import qos
 
 CLOCK_PERIOD_S = 0.025
+"""Between two messages on /clock."""
 SETTLE_S = 0.5
+"""What was found, or published, just now takes so long to arrive at the other side."""
 PATIENCE_S = 3.0
+"""A listener that is not ready is waited for so long."""
 MAX_LATCHED = 1000
 """Of the messages of a latched topic, at most this many are kept for who comes later."""
 _RENAMED = {'tf/msg/tfMessage': 'tf2_msgs/msg/TFMessage'}  # on the way from ROS 1 to ROS 2

@@ -9,6 +9,7 @@ from rclpy.node import Node
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
+from hand_pose_ros.conventions import TRANSPORTS, camera_info_beside, join_transport, split_transport
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.ros import qos
 
@@ -18,8 +19,6 @@ except ImportError:  # ROS 2 Humble
     from rclpy.qos_event import SubscriptionEventCallbacks
 
 IMAGE, CAMERA_INFO, REGION = 'depth/image_rect', 'depth/camera_info', 'hand/region'
-TRANSPORTS = ('compressedDepth', 'compressed')
-"""Besides raw, the better one first; each is a topic below that of the image."""
 
 NO_REGION = (f'no region arrived on {REGION}, so no hand is looked for: publish where it is in the depth image, or set '
              'the parameter detector to network')
@@ -33,8 +32,8 @@ def input_topics(node: Node, transport: str) -> tuple[str, str]:
     """
     image, info = node.resolve_topic_name(IMAGE), node.resolve_topic_name(CAMERA_INFO)
     if info == node.resolve_topic_name(CAMERA_INFO, only_expand=True):
-        info = f'{image.rpartition("/")[0]}/camera_info'
-    return (image if transport == 'raw' else f'{image}/{transport}'), info
+        info = camera_info_beside(image)
+    return join_transport(image, transport), info
 
 
 def subscribe(node: Node, message_type: type, topic: str, callback: Callable[..., None],
@@ -57,9 +56,9 @@ def subscribe(node: Node, message_type: type, topic: str, callback: Callable[...
 
 
 def subscribe_latched(node: Node, message_type: type, topic: str, callback: Callable[..., None]) -> Subscription | None:
-    """Listen, too, to what was said once, where all publishers keep it for whoever comes later (transient local).
+    """Listen, too, to what was said once and is kept for whoever comes later; None if there is nobody to listen to.
 
-    Others would be told, and tell their user, that somebody wants of them what they do not offer.
+    Only where all publishers are transient local: others would log an incompatible QoS.
     """
     infos = node.get_publishers_info_by_topic(topic)
     if not infos or any(info.qos_profile.durability != qos.LATCHED.durability for info in infos):
@@ -94,10 +93,12 @@ def explain_silence(node: Node, topic: str, message_type: type, seconds: float) 
     said = f'no image arrived on {topic} for {seconds:.0f} s; the topic is {describe_publishers(node, topic)}'
     infos = node.get_publishers_info_by_topic(topic)
     if not infos:
+        image, _ = split_transport(topic)
         for transport in TRANSPORTS:
-            if node.count_publishers(f'{topic}/{transport}'):
-                return (f'{said}, but depth is published on {topic}/{transport}: set the parameter transport to '
-                        f'{transport} (at the start: --ros-args -p transport:={transport})')
+            other = join_transport(image, transport)
+            if other != topic and node.count_publishers(other):
+                return (f'{said}, but depth is published on {other}: set the parameter transport to {transport} '
+                        f'(at the start: --ros-args -p transport:={transport})')
         ours = {topic, *(publisher.topic_name for publisher in node.publishers)}
         others = [name for name, types in node.get_topic_names_and_types() if topic_type in types and name not in ours]
         where = f' ({topic_type} is published on {", ".join(others)})' if others else ''

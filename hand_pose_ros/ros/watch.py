@@ -13,6 +13,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from hand_pose_ros import ros
 from hand_pose_ros.bags import check_frame
+from hand_pose_ros.conventions import stamp_ns
 from hand_pose_ros.depth import decode_compressed, decode_image
 from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.estimator import HandEstimate
@@ -20,7 +21,7 @@ from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.msg import HandJointsArray
 from hand_pose_ros.ros import qos, topics
 from hand_pose_ros.ros.camera import Camera
-from hand_pose_ros.ros.conversions import hand_from_msg, stamp_ns
+from hand_pose_ros.ros.conversions import hand_from_msg
 from hand_pose_ros.ros.diagnostics import Statistics
 from hand_pose_ros.ros.params import Params
 from hand_pose_ros.skeleton import Skeleton, get_skeleton

@@ -64,12 +64,15 @@ class Laboratory:
     recipe: Recipe
     machine: Machine
 
+    def __post_init__(self) -> None:
+        self.folder = self.folder.resolve()  # the recipe of a refiner names its base in there
+
     def train(self, name: str, **changes: Any) -> Checkpoint:
         """The trained network of this name; `changes` are those of its recipe."""
         folder = RunFolder(self.folder / 'runs' / name)
         recipe = dataclasses.replace(self.recipe, **changes)
         started = folder.state.exists()
-        if started and folder.recipe() != recipe:
+        if started and _resolved(folder.recipe()) != _resolved(recipe):
             raise HandPoseError(f'{folder.path} was trained with another recipe; choose another --out, or delete it')
         if not (started and folder.checkpoint('last').exists() and load_progress(folder.state)['finished']):
             log.info('training %s', name)
@@ -153,6 +156,11 @@ class Laboratory:
     def write_results(self, name: str, results: Sequence[Result], figure: Figure) -> str:
         """The same for results of networks."""
         return self.write(name, accuracy_table(results), {'results': [result.summary() for result in results]}, figure)
+
+
+def _resolved(recipe: Recipe) -> Recipe:
+    """The same recipe, however the path of its base was written."""
+    return dataclasses.replace(recipe, base=recipe.base and str(Path(recipe.base).resolve()))
 
 
 def _result(name: str, skeleton: Skeleton, estimates: torch.Tensor, truths: torch.Tensor, **info: Any) -> Result:

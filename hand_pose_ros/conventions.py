@@ -1,0 +1,29 @@
+"""Conventions of ROS that hold with and without it: transports of images, where their camera_info is, and stamps."""
+
+from __future__ import annotations
+
+from typing import Any
+
+TRANSPORTS = ('raw', 'compressedDepth', 'compressed')
+"""The better one first. All but raw have a topic below that of the image (image_transport)."""
+
+
+def split_transport(topic: str) -> tuple[str, str]:
+    """The topic of the image and the transport: /depth/image/compressedDepth -> /depth/image, compressedDepth."""
+    image, _, last = topic.rpartition('/')
+    return (image, last) if last in TRANSPORTS[1:] else (topic, 'raw')
+
+
+def join_transport(image_topic: str, transport: str) -> str:
+    """The inverse of `split_transport`."""
+    return image_topic if transport == 'raw' else f'{image_topic}/{transport}'
+
+
+def camera_info_beside(image_topic: str) -> str:
+    """Where the camera_info of an image is looked for: /depth/image -> /depth/camera_info."""
+    return f'{image_topic.rpartition("/")[0]}/camera_info'
+
+
+def stamp_ns(header: Any) -> int:
+    """The stamp of a header in nanoseconds."""
+    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)

@@ -14,12 +14,12 @@ from pathlib import Path
 
 import torch
 
-from hand_pose_ros.cli.bench import measure, patches
 from hand_pose_ros.files import write_json
 from hand_pose_ros.models.checkpoints import load_checkpoint
 from hand_pose_ros.runtime import make_engine
 from hand_pose_ros.runtime.cuda_engine import WARM_UP, CudaEngine
 from hand_pose_ros.runtime.engine import Pipeline, TorchEngine
+from hand_pose_ros.runtime.timing import measure, some_patches
 
 NAMES = ('deep_prior', 'deep_prior_orref', 'hand_dense')
 BATCHES = (64, 1024, 4096)
@@ -27,7 +27,7 @@ BATCHES = (64, 1024, 4096)
 
 def graph_alone(engine: CudaEngine, replays: int = 500) -> float:
     """Milliseconds of a replay whose input and output stay on the GPU."""
-    source = patches(1).to(engine.device)
+    source = some_patches(1).to(engine.device)
     with torch.inference_mode(), torch.cuda.stream(engine.stream):
         for _ in range(WARM_UP):
             engine.pipeline(source)
@@ -61,7 +61,7 @@ def main() -> None:
     parser.add_argument('--json', type=Path, metavar='FILE', help='write the rows there too')
     args = parser.parse_args()
     rows: dict[str, dict[str, float]] = {}
-    one, many = patches(1).numpy(), {f'{count} hands': patches(count).numpy() for count in BATCHES}
+    one, many = some_patches(1).numpy(), {f'{count} hands': some_patches(count).numpy() for count in BATCHES}
     for name in NAMES:
         checkpoint = load_checkpoint(name)
         engine = make_engine(checkpoint.network, 'cuda', refiner=checkpoint.refiner)

@@ -30,9 +30,6 @@ whatever else the machine does meets them alike. floor is the larger of two time
 operations at the rate of a large matrix product, and the weights read once by a matrix-vector product. cpu_ms is the
 CPU time of a call in all threads; with --threads 1 it is what the call takes when nothing else runs.
 """
-_WARM_UP = 5
-_CALLS = 10
-"""Calls of one row before it is the turn of the next."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--model', help='whole frames with these weights, too, by name or path')
     parser.add_argument('--threads', type=count, metavar='N', help='threads for the networks (chosen by the cores)')
     parser.add_argument('--rounds', type=count, default=20, metavar='N',
-                        help=f'rounds of {_CALLS} calls for each row (%(default)s)')
+                        help='rounds of 10 calls for each row (%(default)s)')
     parser.add_argument('--quick', action='store_true',
                         help='one round, and without torch.compile, which takes a minute')
 
@@ -78,31 +75,6 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def measure(calls: dict[str, Callable[[], Any]], rounds: int) -> dict[str, dict[str, float]]:
-    """Time each call `rounds` x 10 times, in turn: one row for each, by name."""
-    for call in calls.values():
-        for _ in range(_WARM_UP):
-            call()
-    wall: dict[str, list[float]] = {name: [] for name in calls}
-    cpu: dict[str, list[float]] = {name: [] for name in calls}
-    for _ in range(rounds):
-        for name, call in calls.items():
-            for _ in range(_CALLS):
-                start, start_cpu = time.perf_counter(), time.process_time()
-                call()
-                cpu[name].append(time.process_time() - start_cpu)
-                wall[name].append(time.perf_counter() - start)
-    return {name: {**summary(wall[name]), 'cpu_ms': summary(cpu[name])['p50_ms']} for name in calls}
-
-
-def summary(seconds: list[float]) -> dict[str, float]:
-    """Times in seconds -> one row: {p50_ms, p99_ms, min_ms, calls}."""
-    import numpy as np
-
-    p50, p99 = np.percentile(seconds, [50, 99]) * 1e3
-    return {'p50_ms': float(p50), 'p99_ms': float(p99), 'min_ms': min(seconds) * 1e3, 'calls': len(seconds)}
-
-
 def _network_rows(name: str, threads: int, rounds: int, compiled: bool) -> dict[str, dict[str, float]]:
     """One network, one patch, over every way to run it."""
     import numpy as np
@@ -111,9 +83,10 @@ def _network_rows(name: str, threads: int, rounds: int, compiled: bool) -> dict[
     from hand_pose_ros.models.checkpoints import load_checkpoint
     from hand_pose_ros.runtime import make_engine
     from hand_pose_ros.runtime.engine import Pipeline, TorchEngine
+    from hand_pose_ros.runtime.timing import measure, some_patches
 
     pipeline = Pipeline(load_checkpoint(name).network).eval()  # the export puts modules back into the mode of the whole
-    patch = patches(1)
+    patch = some_patches(1)
     array = patch.numpy()
     engine = make_engine(pipeline.network, 'cpu', threads)
     eight = np.repeat(array, 8, axis=0)
@@ -166,6 +139,7 @@ def _refiner_rows(architecture: str, threads: int, rounds: int) -> dict[str, dic
     from hand_pose_ros.models import build
     from hand_pose_ros.runtime import make_engine
     from hand_pose_ros.runtime.engine import Pipeline, TorchEngine
+    from hand_pose_ros.runtime.timing import measure, some_patches
 
     class Still(nn.Module):
         """Estimates that cost nothing."""
@@ -175,7 +149,7 @@ def _refiner_rows(architecture: str, threads: int, rounds: int) -> dict[str, dic
 
     refiner = build(architecture).eval()
     alone = [refiner.for_joint(joint) for joint in range(21)]  # type: ignore[operator]
-    patch = patches(1)
+    patch = some_patches(1)
     array, joints = patch.numpy(), Still()(patch)
     plain, engine = TorchEngine(Pipeline(Still(), refiner)), make_engine(Still(), 'cpu', threads, refiner)
 
@@ -192,6 +166,7 @@ def _frame_rows(model: str | None, threads: int, rounds: int) -> dict[str, dict[
     """From a VGA image of 16-bit integers to joints in metres, in all and by stage; a hand that is tracked."""
     from hand_pose_ros.depth import to_metres, to_units
     from hand_pose_ros.estimator import HandPoseEstimator
+    from hand_pose_ros.runtime.timing import WARM_UP, measure, summary
 
     depth, intrinsics = _vga_frame()
     units = to_units(depth)
@@ -219,7 +194,7 @@ def _frame_rows(model: str | None, threads: int, rounds: int) -> dict[str, dict[
 
     rows = measure({f'frame {name}': frame(name) for name in estimators}, rounds)
     for name, seconds in stages.items():
-        rows[name] = summary(seconds[_WARM_UP:])
+        rows[name] = summary(seconds[WARM_UP:])
     return rows
 
 
@@ -227,6 +202,8 @@ def _floor(module: nn.Module, inputs: tuple[Tensor, ...], reads: int = 1) -> dic
     """The least time that the operations and the weights of a module need here: a row, with both parts."""
     import torch
     from torch.utils.flop_counter import FlopCounterMode
+
+    from hand_pose_ros.runtime.timing import measure
 
     with FlopCounterMode(display=False) as counter:
         module(*inputs)
@@ -240,15 +217,6 @@ def _floor(module: nn.Module, inputs: tuple[Tensor, ...], reads: int = 1) -> dic
     floor = max(compute, memory)
     return {'p50_ms': floor, 'p99_ms': floor, 'min_ms': floor, 'compute_ms': compute, 'memory_ms': memory,
             'operations': operations, 'weights': weights}
-
-
-def patches(count: int) -> Tensor:
-    """Half hand, half background, as patches are."""
-    import torch
-
-    patches = torch.rand(count, 1, 128, 128) - 0.5
-    patches[..., 64:] = 1
-    return patches
 
 
 def _vga_frame() -> tuple[Any, Any]:

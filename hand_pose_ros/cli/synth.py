@@ -194,7 +194,7 @@ def _record(args: argparse.Namespace) -> None:
             stamp, frame = (i + 1) * 1_000_000_000 // 30, 'camera_depth_optical_frame'
             middle = joints.mean(axis=0)
             truth = HandEstimate(joints, HAND21.joint_names, np.ones(len(HAND21), np.float32), 1.0, side,
-                                 Cube((float(middle[0]), float(middle[1]), float(middle[2])), 0.3), 'truth')
+                                 Cube.at(middle, 0.3), 'truth')
             bag.write_depth(stamp, frame, depth, camera, codec=None if args.raw else 'png')
             bag.write_hands(stamp, frame, [truth], topic='/truth/joints')
     print(f'{args.out}: {args.number} images')

@@ -230,9 +230,9 @@ def qualitative(lab: Laboratory) -> str:
 
 def runtime(lab: Laboratory) -> str:
     """Milliseconds for one hand on this machine, beside the paper's; random weights take as long as trained ones."""
-    from hand_pose_ros.cli.bench import measure
     from hand_pose_ros.runtime import make_engine
     from hand_pose_ros.runtime.engine import Pipeline, TorchEngine
+    from hand_pose_ros.runtime.timing import measure
 
     def made(name: str) -> tuple[nn.Module, nn.Module | None]:
         first, _, refiner = name.partition(' + ')

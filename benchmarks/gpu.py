@@ -47,7 +47,7 @@ def graph_alone(engine: CudaEngine, replays: int = 500) -> float:
 
 def with_copies(engine: CudaEngine) -> Callable[[], None]:
     """A replay as the engine does it, between two images: the input lies in pinned memory already."""
-    captured = engine.captured[1]
+    captured = engine.captured_for(1)
 
     def call() -> None:
         with torch.cuda.stream(engine.stream):

@@ -17,6 +17,7 @@ from hand_pose_ros.models import build
 from hand_pose_ros.models.checkpoints import load_checkpoint
 from hand_pose_ros.models.dense import HandDense
 from hand_pose_ros.runtime import default_threads, make_engine
+from hand_pose_ros.runtime.cuda_engine import LARGEST, CudaEngine, _Captured
 from hand_pose_ros.runtime.engine import Pipeline, TorchEngine
 from hand_pose_ros.runtime.fused import fuse
 from hand_pose_ros.runtime.lanes import PairedConvolution, fill_lanes
@@ -212,6 +213,37 @@ def test_a_hand_gets_several_threads_where_they_are_faster(seconds, threads, mon
     assert np.array_equal(engine.run(patches), make_engine(network, 'cpu', num_threads=1).run(patches))
 
 
+@pytest.mark.parametrize('count', [0, 1, LARGEST, 3 * LARGEST + 5])
+def test_many_hands_run_by_turns_in_graphs_that_none_overwrites_too_soon(count, monkeypatch):
+    """With graphs that do their work when they are waited for, at the latest possible time."""
+    class Late:
+        def __init__(self, size: int) -> None:
+            self.patches, self.joints = torch.zeros(size, 1, 128, 128), torch.zeros(size, 21, 3)
+
+        def replay(self) -> None:
+            self.pending = True
+
+        def record(self) -> None:
+            assert self.pending
+
+        def synchronize(self) -> None:
+            self.joints.copy_(self.patches[:, 0, 0, 0, None, None].expand_as(self.joints))
+
+    def capture(engine: CudaEngine, size: int) -> _Captured:
+        late = Late(size)
+        return _Captured(late, late.patches, (late.joints,), late)
+
+    monkeypatch.setattr(CudaEngine, '_capture', capture)
+    engine = object.__new__(CudaEngine)
+    engine.outputs, engine.stream, engine._captured = ('joints',), None, {}
+    patches = np.zeros((count, 1, 128, 128), np.float32)
+    patches[:, 0, 0, 0] = np.arange(count)
+    joints = engine.run(patches)
+    assert joints.shape == (count, 21, 3)
+    np.testing.assert_array_equal(joints[:, 0, 0], np.arange(count))
+    assert len(engine._captured) <= 3
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason='needs a CUDA GPU')
 @pytest.mark.parametrize('refiner', [None, 'or_ref'])
 @pytest.mark.parametrize('architecture', ARCHITECTURES)
@@ -220,7 +252,8 @@ def test_the_gpu_engine_equals_plain_pytorch(architecture, refiner):
     second = trained_refiner(refiner) if refiner else None
     engine = make_engine(network, 'cuda', refiner=second)
     plain = TorchEngine(Pipeline(network, second))
-    for count in (1, 3, 2, 9):  # graphs of 1, 4, 2 and 16
+    many = [LARGEST + 3] if architecture == 'deep_prior' else []
+    for count in [1, 3, 2, 9, *many]:  # graphs of 1, 4, 2 and 16, and of the largest
         patches = hand_patches(count, seed=count)
         assert_equal_in_half_precision(engine.run(patches), plain.run(patches), architecture)
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from collections import deque
+from dataclasses import dataclass, field
 from types import ModuleType
 
 import numpy as np
@@ -16,6 +17,8 @@ from hand_pose_ros.runtime.fused import fuse
 
 WARM_UP = 3
 """Runs before the capture: libraries choose algorithms and allocate in the first ones, which a graph must not hold."""
+LARGEST = 1024
+"""Hands of one graph. Of more, the next are brought to pinned memory while the GPU is at these."""
 
 _log = logging.getLogger(__name__)
 
@@ -27,13 +30,19 @@ class _Captured:
     """Pinned (N, 1, 128, 128), where the graph reads from, in the precision that the network takes."""
     answer: tuple[Tensor, ...]
     """Pinned, where the graph writes to."""
+    done: torch.cuda.Event = field(default_factory=torch.cuda.Event)
+
+    def finish(self, count: int) -> list[Array]:
+        """Wait for the replay; the first `count` answers, copied, for the next replay writes to the same memory."""
+        self.done.synchronize()
+        return [tensor[:count].numpy().copy() for tensor in self.answer]
 
 
 class CudaEngine(Engine):
     """One CUDA graph for each batch size that is a power of two, captured when first needed.
 
-    Other sizes run in the next larger graph. Input and output lie in pinned host memory, and the copies are part of
-    the graph, so that a call is one launch and one wait.
+    Other sizes run in the next larger graph, or, beyond the largest, in two of its size by turns. Input and output lie
+    in pinned host memory, and the copies are part of the graph, so that a call is one launch and one wait.
     """
 
     name = 'cuda graph'
@@ -44,24 +53,32 @@ class CudaEngine(Engine):
         pipeline.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.pipeline = pipeline.to(self.device).reduce_precision()
         self.stream = torch.cuda.Stream(self.device)
-        self.captured: dict[int, _Captured] = {}
-        self._captured_for(1)  # the first image shall not wait
+        self._captured: dict[tuple[int, int], _Captured] = {}
+        self.captured_for(1)  # the first image shall not wait
 
     def _run(self, patches: Array) -> list[Array]:
-        count = len(patches)
-        captured = self._captured_for(count)
-        captured.patches[:count].copy_(torch.from_numpy(np.ascontiguousarray(patches)))
-        with torch.cuda.stream(self.stream):
-            captured.graph.replay()
-        self.stream.synchronize()
-        # Copies, for the next replay writes to the same memory.
-        return [tensor[:count].numpy().copy() for tensor in captured.answer]
+        parts: list[list[Array]] = []
+        running: deque[tuple[_Captured, int]] = deque()
+        for turn, start in enumerate(range(0, max(len(patches), 1), LARGEST)):
+            if len(running) == 2:
+                captured, count = running.popleft()
+                parts.append(captured.finish(count))
+            some = patches[start:start + LARGEST]
+            captured = self.captured_for(len(some), turn % 2)
+            captured.patches[:len(some)].copy_(torch.from_numpy(np.ascontiguousarray(some)))
+            with torch.cuda.stream(self.stream):
+                captured.graph.replay()
+                captured.done.record()
+            running.append((captured, len(some)))
+        parts += [captured.finish(count) for captured, count in running]
+        return [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
 
-    def _captured_for(self, count: int) -> _Captured:
+    def captured_for(self, count: int, turn: int = 0) -> _Captured:
+        """The graph for this many hands, at most LARGEST; of another `turn` another one."""
         size = 1 << max(count - 1, 0).bit_length()
-        if size not in self.captured:
-            self.captured[size] = self._capture(size)
-        return self.captured[size]
+        if (size, turn) not in self._captured:
+            self._captured[size, turn] = self._capture(size)
+        return self._captured[size, turn]
 
     def _capture(self, size: int) -> _Captured:
         source = torch.ones(size, 1, PATCH_SIZE, PATCH_SIZE, dtype=self.pipeline.precision, pin_memory=True)

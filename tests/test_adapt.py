@@ -84,6 +84,14 @@ def test_weights_come_out_with_a_comparison(bag, little, tmp_path, capsys):
     assert HandPoseEstimator.from_pretrained(out, device='cpu').metadata['name'] == 'mine'
 
 
+def test_images_of_one_stamp_cannot_be_parted(tmp_path, capsys):
+    with BagWriter(tmp_path / 'still.mcap') as writer:
+        for _ in range(3):
+            writer.write_depth(5, 'camera', np.full((120, 160), 3, np.float32), Intrinsics(150, 150, 80, 60, 160, 120))
+    assert main(['adapt', str(tmp_path / 'still.mcap'), '--out', str(tmp_path / 'x.safetensors')]) == 1
+    assert 'still.mcap: all images have the stamp 5 ns' in capsys.readouterr().err
+
+
 def test_what_got_worse_is_said(bag, little, tmp_path, capsys, monkeypatch):
     """Weights that were ruined by training: they find no hand any more, and know nothing of the benchmark."""
     monkeypatch.setattr(adapt, 'fine_tune', lambda *_: build('hand_dense', joints=21))

@@ -5,8 +5,10 @@ import os
 import socket
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -214,6 +216,13 @@ def test_a_label_is_for_one_image(tmp_path, model, settings, capsys):
     assert 'several labels have the stamp 0 ns' in capsys.readouterr().err
 
 
+def test_hands_that_were_estimated_are_no_labels_of_images(tmp_path, bag, model, capsys):
+    hands = tmp_path / 'hands.npz'
+    assert main(['estimate', *arguments(bag, model)[1:], '--out', str(hands)]) == 0
+    assert main(arguments(bag, model, '--ground-truth', hands)) == 1
+    assert 'hands.npz: its rows are hands, and not images' in capsys.readouterr().err
+
+
 def test_labels_at_the_camera_are_none(tmp_path, bag, settings, result):
     truth = result.predictions.copy()
     truth[3], truth[5, 7] = 0, 0
@@ -329,6 +338,51 @@ def test_the_live_node_answers_what_the_estimator_says(ros_domain, tmp_path, mod
     until = int(np.argmin(answered)) if got['dropped'] else 8
     assert live[:until] == pytest.approx(evaluate_bag(bag, settings).predictions[:until], abs=1e-5)
     assert 0 < got['latency_ms']['image to joints']['p50'] < 2000
+
+
+def test_the_live_node_is_shown_a_damaged_bag_as_far_as_it_goes(ros_domain, tmp_path, model, capsys):
+    pytest.importorskip('rclpy', reason='ROS is not installed')
+    whole = record(tmp_path / 'bag.mcap', step_ns=200_000_000).read_bytes()
+    (tmp_path / 'cut.mcap').write_bytes(whole[:int(len(whole) * 0.6)])
+    assert main(arguments(tmp_path / 'cut.mcap', model, '--via-ros', '--json', tmp_path / 'r.json')) == 1
+    got = json.loads((tmp_path / 'r.json').read_text())
+    assert got['damaged'] and got['dropped'] < got['frames_total'] < FRAMES
+    assert 'before the damage' in capsys.readouterr().err
+
+
+def test_images_of_one_stamp_are_not_played_through_the_node(tmp_path, model, capsys):
+    pytest.importorskip('rclpy', reason='ROS is not installed')
+    bag = record(tmp_path / 'still.mcap', step_ns=0)
+    assert main(arguments(bag, model)) == 0
+    assert main(arguments(bag, model, '--via-ros')) == 1
+    assert f'still.mcap: {FRAMES} images have the stamp 1000000000 ns' in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not Path('/proc/self/task').exists(), reason='looks for processes in /proc')
+def test_processes_that_evaluate_end_with_the_one_that_started_them(tmp_path):
+    bag, image = tmp_path / 'long.mcap', depth_image(0)
+    with BagWriter(bag) as writer:
+        for k in range(1500):
+            writer.write_depth(10**9 + k * STEP_NS, 'camera', image, CAMERA)
+    whole = subprocess.Popen([sys.executable, '-c', 'from hand_pose_ros.cli import main; main()',
+                              'evaluate', str(bag), str(bag), '--device', 'cpu', '--jobs', '2'])
+
+    def children():
+        return Path(f'/proc/{whole.pid}/task/{whole.pid}/children').read_text().split()
+
+    def wait(until):
+        end = time.monotonic() + 60
+        while not until() and time.monotonic() < end:
+            time.sleep(0.05)
+        return until()
+
+    assert wait(lambda: len(children()) >= 3), 'two workers and what watches over their resources'
+    started = children()
+    time.sleep(4)  # they are to be at work
+    assert whole.poll() is None
+    whole.kill()
+    whole.wait()
+    assert wait(lambda: not any(Path(f'/proc/{one}').exists() for one in started))
 
 
 def test_the_default_weights_have_one_name_with_and_without_the_node(tmp_path, bag, monkeypatch):

@@ -12,6 +12,7 @@ import pytest
 
 from hand_pose_ros.cli import main
 from hand_pose_ros.evaluation import metrics, plots
+from hand_pose_ros.evaluation.published import named_apart
 from hand_pose_ros.evaluation.report import write_report
 from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.geometry import Intrinsics
@@ -178,6 +179,22 @@ def test_compare_prints_tables_and_intervals(result, tmp_path, capsys):
     replace(better, name=result.name).save(tmp_path / 'b.npz')  # two results of one bag have its name
     assert main(['compare', str(tmp_path / 'a.npz'), str(tmp_path / 'b.npz'), '--block', '1']) == 0
     assert 'b - a: -' in capsys.readouterr().out
+
+
+def test_results_of_one_bag_are_told_apart_everywhere(result, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    worse = replace(result, predictions=result.predictions + 0.05)
+    for name, one in (('day1/r.npz', result), ('day2/r.npz', worse), ('r.npz', worse)):
+        one.save(name)
+    assert main(['compare', 'day1/r.npz', 'day2/r.npz', '--out', 'both']) == 0
+    assert 'day2/r - day1/r: +' in capsys.readouterr().out
+    page = (tmp_path / 'both' / 'report.html').read_text()
+    rows = re.findall(r'<tr><td>day(\d)/r</td><td>([\d.]+)</td>', page[page.index('Which joints are hard'):])
+    assert [name for name, _ in rows] == ['1', '2'] and float(rows[1][1]) > float(rows[0][1]) + 20
+    assert [one.name for one in named_apart([result, worse, worse], ['', 'r.npz', 'r.npz'])] == [
+        result.name, 'r', 'r (2)']
+    given = [one.name for one in named_apart([result, worse], ['x=r.npz', 'x=r.npz'])]
+    assert given == [result.name, f'{result.name} (2)']
 
 
 def test_what_is_compared_is_not_written_over(result, tmp_path, monkeypatch, capsys):

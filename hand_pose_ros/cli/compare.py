@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +12,7 @@ from hand_pose_ros.cli.arguments import check_outputs, count
 from hand_pose_ros.cli.evaluate import print_summaries
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.evaluation import metrics
-from hand_pose_ros.evaluation.published import DATASETS, load_result, split_source
+from hand_pose_ros.evaluation.published import DATASETS, load_result, named_apart, split_source
 from hand_pose_ros.evaluation.results import Result, told_notes
 from hand_pose_ros.files import write_json
 
@@ -49,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     check_outputs((args.json, args.out and Path(args.out) / 'report.html'),
                   (args.ground_truth, *(split_source(source)[1] for source in args.results)))
     dataset = DATASETS[args.dataset] if args.dataset else None
-    results = _named_apart([load_result(source, args.ground_truth, dataset) for source in args.results], args.results)
+    results = named_apart([load_result(source, args.ground_truth, dataset) for source in args.results], args.results)
     for note in told_notes(results):
         print(f'NOTE: {note}', file=sys.stderr)
     for result in results:
@@ -76,14 +74,6 @@ def run(args: argparse.Namespace) -> int:
             raise InputError('results with different joints cannot be drawn into one picture: leave out --out')
         print(f'report: {write_report(results, Path(args.out))}')
     return 0
-
-
-def _named_apart(results: Sequence[Result], sources: Sequence[str]) -> list[Result]:
-    """The same results; those of one bag, which have its name, with the names of their files."""
-    names = [result.name for result in results]
-    given, paths = zip(*map(split_source, sources), strict=True)
-    return [replace(result, name=Path(path).stem) if names.count(result.name) > 1 and not name else result
-            for result, name, path in zip(results, given, paths, strict=True)]
 
 
 def _not_paired(a: Result, b: Result) -> str:

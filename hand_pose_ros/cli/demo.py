@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -47,6 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Play, draw, and sum up; 1 if an image was left without an answer."""
+    from hand_pose_ros.evaluation.bag_evaluation import until_damaged
     from hand_pose_ros.ros.conversions import hand_from_msg
     from hand_pose_ros.ros.live import play_through_node
 
@@ -54,20 +57,31 @@ def run(args: argparse.Namespace) -> int:
     args.out.mkdir(parents=True, exist_ok=True)  # now, not after minutes of work
     parameters = {'model': args.model} if args.model else {}
     with DepthBag(path) as bag:
-        shown = '' if args.bag else ' (a synthetic hand)'
-        print(f'playing {len(bag)} depth images of {path}{shown} through the node ...', flush=True)
+        what = '' if args.bag else ' (a synthetic hand)'
+        print(f'playing {len(bag)} depth images of {path}{what} through the node ...', flush=True)
         answers = play_through_node(bag, parameters=parameters, patient=True)
         skeleton = get_skeleton(answers.skeleton)
         hands = {stamp: [hand_from_msg(hand, skeleton) for hand in answer.hands]
                  for stamp, answer in answers.hands.items()}
-        frames = list(bag)
-    pictures = [overlay(frame.depth, frame.intrinsics, hands.get(frame.stamp_ns, []), skeleton, ANIMATION_HEIGHT)
-                for frame in frames]
-    summary = summarise([frame.stamp_ns for frame in frames], answers, hands, _truth(path, skeleton))
+        stamps: list[int] = []
+        shown: list[int] = []
+        pictures: list[Picture] = []
+        notes: list[str] = []
+        for frame, _ in until_damaged(bag, notes):
+            stamps.append(frame.stamp_ns)
+            with suppress(InputError):  # one that cannot be decoded; the node tells of it
+                pictures.append(overlay(frame.depth, frame.intrinsics, hands.get(frame.stamp_ns, []), skeleton,
+                                        ANIMATION_HEIGHT))
+                shown.append(frame.stamp_ns)
+    for note in notes:
+        print(f'NOTE: {note}', file=sys.stderr)
+    if not pictures:
+        raise InputError(f'{path}: there is no depth image that can be decoded')
+    summary = summarise(stamps, answers, hands, _truth(path, skeleton))
     chosen = np.linspace(0, len(pictures) - 1, min(SHEET_PICTURES, len(pictures))).round().astype(int)
     sheet = contact_sheet([pictures[i] for i in chosen], 3)
     write_bytes(args.out / 'sheet.png', cv2.imencode('.png', sheet)[1].tobytes())
-    _animate(args.out / 'animation.webp', pictures, [frame.stamp_ns for frame in frames])
+    _animate(args.out / 'animation.webp', pictures, shown)
     write_json(args.out / 'summary.json', summary)
     for name, value in summary.items():
         print(f'  {name.replace("_", " "):<22}{value if isinstance(value, int) or value is None else f"{value:.1f}"}')

@@ -6,6 +6,7 @@ import argparse
 import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -118,7 +119,7 @@ def run(args: argparse.Namespace) -> int:
         else:
             from hand_pose_ros.evaluation.benchmark_evaluation import evaluate_benchmark
             result = evaluate_benchmark(args.model, args.device, progress=_progress('batches'))
-        _deliver(result, others, None, args.json, args.out, args.report)
+        _deliver(result, others, None, args.json, args.out, args.report, args.compare)
         return 0
     return _run_bag(args) if len(args.bags) == 1 else _run_bags(args)
 
@@ -144,7 +145,7 @@ def _run_text(args: argparse.Namespace) -> int:
                          f'{args.predictions} is unknown')
     others = [published.load_result(source, args.ground_truth, dataset) for source in args.compare]
     read_depths = partial(tompson.read_nyu_depths, args.depth_folder) if args.depth_folder else None
-    _deliver(result, others, read_depths, args.json, args.out, args.report)
+    _deliver(result, others, read_depths, args.json, args.out, args.report, args.compare)
     return 0
 
 
@@ -159,7 +160,7 @@ def _run_bag(args: argparse.Namespace) -> int:
     result = _evaluate_live(args, settings) if args.via_ros else \
         evaluate_bag(args.bags[0], settings, _progress('frames'), sink)
     depths = partial(read_depths, args.bags[0], settings=settings)
-    _deliver(result, others, depths, args.json, args.out, args.report)
+    _deliver(result, others, depths, args.json, args.out, args.report, args.compare)
     return int(result.info['damaged'])
 
 
@@ -168,6 +169,7 @@ def _evaluate_live(args: argparse.Namespace, settings: Settings) -> Result:
     if args.out_bag:
         args.parser.error('--out-bag does not work with --via-ros: record /hand/joints instead')
     from hand_pose_ros.bags import DepthBag
+    from hand_pose_ros.evaluation.bag_evaluation import until_damaged
     from hand_pose_ros.evaluation.ground_truth import read_truth, with_truth
     from hand_pose_ros.models.checkpoints import DEFAULT, load_checkpoint
     from hand_pose_ros.ros.live import play_through_node
@@ -181,9 +183,16 @@ def _evaluate_live(args: argparse.Namespace, settings: Settings) -> Result:
                                                                           strict=True)}
     skeleton = get_skeleton(load_checkpoint(args.model).metadata['skeleton'])
     truth = args.ground_truth and read_truth(args.ground_truth, args.bags[0], skeleton)
+    notes: list[str] = []
+    stamps: list[int] = []
+    intrinsics, frame_id = None, ''
     with DepthBag(args.bags[0], **settings.bag) as bag:
-        first = next(iter(bag))
-        stamps = [frame.stamp_ns for frame in bag]
+        for frame, _ in until_damaged(bag, notes):
+            stamps.append(frame.stamp_ns)
+            with suppress(InputError):  # one image that cannot be decoded is none that was lost
+                intrinsics, frame_id = intrinsics or frame.intrinsics, frame.frame_id
+        if intrinsics is None:
+            raise InputError(f'{args.bags[0]}: there is no depth image that can be decoded')
         answers = play_through_node(bag, args.camera_info_topic,
                                     {name: value for name, value in parameters.items() if value is not None})
         topic = bag.depth_topic
@@ -193,13 +202,16 @@ def _evaluate_live(args: argparse.Namespace, settings: Settings) -> Result:
             joints[row] = [(point.x, point.y, point.z) for point in answers.hands[stamp].hands[0].joints]
     latency = np.array([answers.latency_s.get(stamp, np.nan) for stamp in stamps])
     dropped = sum(stamp not in answers.hands for stamp in stamps)
-    notes = (f'{dropped} of {len(stamps)} images got no answer from the node and count as images without a hand.',)
+    damaged = bool(notes)
+    if dropped:
+        notes.append(f'{dropped} of {len(stamps)} images got no answer from the node and count as images without a '
+                     'hand.')
     result = Result(
-        Path(args.bags[0]).stem, skeleton, first.intrinsics, joints, stamps_ns=np.array(stamps),
-        seconds={'image to joints': latency}, notes=notes if dropped else (), info={
+        Path(args.bags[0]).stem, skeleton, intrinsics, joints, stamps_ns=np.array(stamps),
+        seconds={'image to joints': latency}, notes=tuple(notes), info={
             'bag': args.bags[0], 'depth_topic': topic, 'model': args.model or DEFAULT, 'device': args.device,
-            'via_ros': True, 'dropped': dropped, 'damaged': False})
-    return with_truth(result, truth, first.frame_id) if truth else result
+            'via_ros': True, 'dropped': dropped, 'damaged': damaged})
+    return with_truth(result, truth, frame_id) if truth else result
 
 
 def _run_bags(args: argparse.Namespace) -> int:
@@ -254,8 +266,10 @@ def _names(bags: Sequence[str]) -> dict[str, str]:
 
 
 def _deliver(result: Result, others: Sequence[Result], read_depths: Callable[[Sequence[int]], dict[int, Any]] | None,
-             json: str | None = None, out: str | Path | None = None, report: str | Path | None = None) -> None:
-    """Print the numbers, and write the files that were asked for."""
+             json: str | None = None, out: str | Path | None = None, report: str | Path | None = None,
+             sources: Sequence[str] = ()) -> None:
+    """Print the numbers, and write the files that were asked for; `sources` are those of the others."""
+    result, *others = published.named_apart([result, *others], ['', *sources])
     for note in told_notes([result, *others]):
         print(f'NOTE: {note}', file=sys.stderr)
     summary = result.summary()

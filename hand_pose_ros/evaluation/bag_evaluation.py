@@ -7,7 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
-from contextlib import AbstractContextManager, ExitStack, closing
+from contextlib import AbstractContextManager, ExitStack, closing, suppress
 from dataclasses import dataclass, field, replace
 from datetime import timedelta
 from itertools import islice, starmap
@@ -26,6 +26,7 @@ from hand_pose_ros.evaluation.progress import Progress, silent
 from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.models.checkpoints import DEFAULT
+from hand_pose_ros.processes import leave_with_parent
 from hand_pose_ros.runtime import cores
 from hand_pose_ros.skeleton import Skeleton
 
@@ -91,7 +92,7 @@ def evaluate_bag(path: str | Path, settings: Settings, progress: Progress = sile
     with ExitStack() as stack:
         bag = stack.enter_context(DepthBag(path, **settings.bag))
         sink = stack.enter_context(open_sink(estimator.skeleton, estimator.metadata)) if open_sink else None
-        images = starmap(_Image, _until_damaged(bag, notes))
+        images = starmap(_Image, until_damaged(bag, notes))
         done = stack.enter_context(closing(_in_background(record.add, images)))
         for image, hands in progress(done, len(bag)):
             if sink:
@@ -145,7 +146,8 @@ def read_depths(path: str | Path, rows: Sequence[int], settings: Settings) -> di
     with DepthBag(path, **settings.bag) as bag:
         for row, frame in enumerate(islice(bag, max(rows, default=-1) + 1)):
             if row in rows:
-                depths[row] = frame.depth
+                with suppress(InputError):
+                    depths[row] = frame.depth
     return depths
 
 
@@ -212,7 +214,7 @@ def _in_background(work: Callable[[_T], _R], items: Iterable[_T]) -> Generator[t
             yield item, result.result()
 
 
-def _until_damaged(frames: Iterable[Frame], notes: list[str]) -> Iterator[tuple[Frame, float]]:
+def until_damaged(frames: Iterable[Frame], notes: list[str]) -> Iterator[tuple[Frame, float]]:
     """The frames and how many seconds each took to be read.
 
     They end where the bag is damaged, with a note of it; before the first frame that is an error.
@@ -236,7 +238,7 @@ def _attempts(paths: Sequence[str | Path], settings: Settings, sinks: Mapping[st
         for path in paths:
             yield path, _attempt(path, settings, sinks.get(path))
         return
-    pool = ProcessPoolExecutor(workers, get_context('spawn'))
+    pool = ProcessPoolExecutor(workers, get_context('spawn'), leave_with_parent)
     try:
         futures = {pool.submit(_attempt, path, settings, sinks.get(path)): path for path in paths}
         for future in as_completed(futures):

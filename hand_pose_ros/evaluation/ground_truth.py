@@ -89,6 +89,9 @@ def _read(source: str, bag: str | Path, skeleton: Skeleton) -> Truth:
         return Truth(source, read_text(source, skeleton))
     try:
         with np.load(source) as file:
+            if 'frame' in file:
+                raise InputError(f'{source}: its rows are hands, and not images, as `hand-pose estimate` writes them: '
+                                 'give a row for each image')
             stamps, joints = file.get('stamps_ns'), file['joints'].astype(np.float64)
     except (OSError, *DAMAGE):
         raise InputError(f'{source}: not an .npz file with an array joints (frames, joints, 3) in metres') from None

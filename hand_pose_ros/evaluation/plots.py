@@ -86,7 +86,7 @@ def over_time(result: Result) -> Figure:
         axes.annotate(name, (at[start], 1), xycoords=('data', 'axes fraction'), xytext=(4, -2), fontsize=9,
                       textcoords='offset points', va='top', color='#4a5560')
     axes.set(title='Error over time', xlabel=label, ylabel='error, mm', ylim=(0, top),
-             xlim=(at[0], at[-1]) if len(at) > 1 else None)
+             xlim=(at[0], at[-1]) if at[-1] > at[0] else None)
     axes.legend(fontsize=9, ncols=3, loc='lower right', bbox_to_anchor=(1, 1))
     return figure
 
@@ -100,7 +100,7 @@ def latency(result: Result) -> Figure:
     axes.stackplot(at, *stages.values(), labels=list(stages), colors=COLORS, lw=0, step='mid')
     total = np.sum(list(stages.values()), axis=0)
     axes.set(title='Time of each frame', xlabel=label, ylabel='ms', ylim=(0, np.percentile(total, 99.5) * 1.1),
-             xlim=(at[0], at[-1]) if len(at) > 1 else None)
+             xlim=(at[0], at[-1]) if at[-1] > at[0] else None)
     axes.legend(fontsize=9, ncols=len(stages), loc='lower right', bbox_to_anchor=(1, 1))
     return figure
 

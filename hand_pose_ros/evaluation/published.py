@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import gzip
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -153,6 +153,26 @@ def split_source(source: str) -> tuple[str, str]:
     """Name and path of `FILE` or `NAME=FILE`; the name is empty if none was given. A file's own name may hold a `=`."""
     name, equals, path = source.partition('=')
     return (name, path) if equals and not Path(source).exists() else ('', source)
+
+
+def named_apart(results: Sequence[Result], sources: Sequence[str]) -> list[Result]:
+    """The same results under names that differ.
+
+    One that has the name of another, without having been given it, is called by its file, with as many folders as it
+    takes; files that are the same are numbered.
+
+    Args:
+        sources: as in `load_result`, for each result; empty for one that comes from no file and keeps its name.
+    """
+    names = [result.name for result in results]
+    given, paths = zip(*map(split_source, sources), strict=True)
+    for parts in range(1, max(len(Path(path).parts) for path in paths) + 1):
+        names = [str(Path(*Path(path).with_suffix('').parts[-parts:]))
+                 if names.count(name) > 1 and path and not own else name
+                 for name, own, path in zip(names, given, paths, strict=True)]
+    numbers = [names[:i].count(name) + 1 for i, name in enumerate(names)]
+    return [replace(result, name=name if number == 1 else f'{name} ({number})')
+            for result, name, number in zip(results, names, numbers, strict=True)]
 
 
 def load_result(source: str, truth: str | Path | None = None, dataset: Dataset | None = None) -> Result:

@@ -200,9 +200,8 @@ def _accuracy(results: Sequence[Result]) -> str:
 
 def _fingers(results: Sequence[Result]) -> str:
     scored = [r for r in results if r.truth is not None]
-    table = {r.name: metrics.per_finger_mm(r.errors_mm, r.skeleton) for r in scored}
-    names = (*FINGERS, 'palm')
-    return _table(('mean error, mm', *names), [(n, *(number(v, 1) for v in row.values())) for n, row in table.items()])
+    rows = [(r.name, *(number(v, 1) for v in metrics.per_finger_mm(r.errors_mm, r.skeleton).values())) for r in scored]
+    return _table(('mean error, mm', *FINGERS, 'palm'), rows)
 
 
 def _latency(summary: dict[str, Any]) -> str:

@@ -9,8 +9,9 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +23,7 @@ from sensor_msgs.msg import CompressedImage, Image
 
 from hand_pose_ros.bags import DepthBag
 from hand_pose_ros.conventions import camera_info_beside, split_transport, stamp_ns
-from hand_pose_ros.errors import HandPoseError
+from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.msg import HandJointsArray, HandSkeleton
 from hand_pose_ros.ros import qos
 from hand_pose_ros.ros.replay import Replay
@@ -59,10 +60,19 @@ def play_through_node(bag: DepthBag, camera_info_topic: str | None = None,
         patient: wait for each answer before the next image, so that a machine that is too slow, or busy with something
             else, plays slower; otherwise the node drops images, as it would those of a camera.
 
+    A damaged bag is played as far as it goes.
+
     Raises:
         HandPoseError: the node does not come up, or dies.
-        InputError: the bag cannot be played.
+        InputError: the bag cannot be played, or two of its images have the same stamp.
     """
+    stamps: Counter[int] = Counter()
+    with suppress(InputError):
+        for frame in bag:
+            stamps[frame.stamp_ns] += 1
+    if twice := [stamp for stamp, number in stamps.items() if number > 1]:
+        raise InputError(f'{bag.path}: {stamps[twice[0]]} images have the stamp {twice[0]} ns, so which answer of the '
+                         'node belongs to which image cannot be told: evaluate it without the node')
     namespace = f'/evaluation_{os.getpid()}'
     image, transport = split_transport(bag.depth_topic)
     info = camera_info_topic or camera_info_beside(image)
@@ -87,7 +97,11 @@ def play_through_node(bag: DepthBag, camera_info_topic: str | None = None,
 
             try:
                 replay.wait_for_subscribers(START_TIMEOUT_S, 2 + len(infos))  # node and listener; camera_info: node
-                replay.play(ready=answered if patient else None)
+                try:
+                    replay.play(ready=answered if patient else None)
+                except InputError:
+                    if not replay.published[bag.depth_topic]:
+                        raise
                 listener.wait_until_quiet()  # the last image goes with its publisher, if it is still on the way
             finally:
                 replay.close()

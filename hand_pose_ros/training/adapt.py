@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from hand_pose_ros.bags import Frame
 from hand_pose_ros.datasets import Batch, joints_in_metres
 from hand_pose_ros.datasets.base import mirrored
-from hand_pose_ros.errors import HandPoseError
+from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.estimator import HandEstimate
 from hand_pose_ros.evaluation.bag_evaluation import Settings, evaluate_bag
 from hand_pose_ros.evaluation.progress import Progress
@@ -132,6 +132,10 @@ def look(bag: str | Path, settings: Settings, progress: Progress) -> Look:
     """
     crops = _Crops()
     result = evaluate_bag(bag, settings, progress, lambda *_: nullcontext(crops))
+    assert result.stamps_ns is not None
+    if len(result.stamps_ns) > 1 and np.ptp(result.stamps_ns) == 0:
+        raise InputError(f'{bag}: all images have the stamp {result.stamps_ns[0]} ns, so what to learn from and what '
+                         'to judge on cannot be told apart by time: record it again, with a clock')
     return Look(result, *crops.batch())
 
 

@@ -84,3 +84,15 @@ def test_an_image_without_an_answer_is_counted(monkeypatch: pytest.MonkeyPatch, 
     write_bag(tmp_path / 'hand.mcap')
     monkeypatch.setattr('hand_pose_ros.ros.live.play_through_node', lambda *_, **__: answers)
     assert main(['demo', '--bag', str(tmp_path / 'hand.mcap'), '--out', str(tmp_path / 'out')]) == 1
+
+
+def test_an_image_that_cannot_be_decoded_is_left_out_of_the_pictures(monkeypatch: pytest.MonkeyPatch,
+                                                                     tmp_path: Path) -> None:
+    monkeypatch.setattr('hand_pose_ros.ros.live.play_through_node', lambda *_, **__: Answers('hand21', {}, {}))
+    camera, bag = Intrinsics(280, 280, 160, 120, 320, 240), tmp_path / 'hole.mcap'
+    with BagWriter(bag) as writer:
+        for i, height in enumerate((120, 240, 240)):  # the first is no image of this camera
+            writer.write_depth(10**9 + i, 'camera', np.full((height, 320), 2, np.float32), camera)
+    assert main(['demo', '--bag', str(bag), '--out', str(tmp_path / 'out')]) == 1
+    assert json.loads((tmp_path / 'out' / 'summary.json').read_text())['frames_in'] == 3
+    assert (tmp_path / 'out' / 'animation.webp').exists()

@@ -42,6 +42,8 @@ def main() -> int:
     parser.add_argument('--out', type=Path, required=True, metavar='FOLDER', help='gets bags/ and run/')
     parser.add_argument('--min-score', type=float, default=0.8, help='hands below are not learned from (0.8)')
     args, more = parser.parse_known_args()
+    if args.out.exists():
+        parser.error(f'{args.out} is there already, with bags that would be learned from, too: choose another --out')
 
     estimator = HandPoseEstimator.from_pretrained()
     for split in ('train', 'val'):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,7 +20,7 @@ def in_one_step(path: str | Path) -> Iterator[Path]:
     A link stays one, and its target is replaced. A device or FIFO (/dev/stdout) is written to directly.
 
     Raises:
-        InputError: the folder cannot be made or written.
+        InputError: the folder cannot be made or written, or the disk is full.
     """
     if _takes_files(path):
         yield Path(path)
@@ -28,11 +29,24 @@ def in_one_step(path: str | Path) -> Iterator[Path]:
     part = _begin(path)
     mode = part.stat().st_mode
     try:
-        yield part
+        with naming_full_disk(path):
+            yield part
         os.chmod(part, mode)  # some libraries keep their files to their owner
         os.replace(part, path)
     finally:
         part.unlink(missing_ok=True)
+
+
+@contextmanager
+def naming_full_disk(path: str | Path) -> Iterator[None]:
+    """Raise InputError with the name of the file if what is done ends because a disk is full."""
+    try:
+        yield
+    except Exception as error:  # libraries say it with exceptions of their own
+        if re.search('No space left|disk is full|quota exceeded', str(error), re.IGNORECASE):
+            raise InputError(f'{path}: cannot be written, for the disk is full: make room, or choose another place'
+                             ) from error
+        raise
 
 
 def check_writable(path: str | Path) -> None:

@@ -1,5 +1,6 @@
 """What bags promise: three formats in, frame by frame with their camera; complete or not there at all when written."""
 
+import sqlite3
 import struct
 from pathlib import Path
 from types import SimpleNamespace
@@ -329,3 +330,16 @@ def test_a_bag_appears_only_when_it_is_complete(tmp_path, depths):
     (tmp_path / 'folder').mkdir()
     with pytest.raises(InputError, match='something already'):
         BagWriter(tmp_path / 'folder')
+
+
+@pytest.mark.parametrize('name', ['x.mcap', 'x.db3', 'folder'])
+def test_a_full_disk_is_told_of_with_the_bag(tmp_path, monkeypatch, name):
+    def full(*_):
+        raise OSError(28, 'No space left on device') if name != 'x.db3' else sqlite3.OperationalError(
+            'database or disk is full')
+
+    bag = BagWriter(tmp_path / name)
+    monkeypatch.setattr(bag._writer, 'write', full)
+    with pytest.raises(InputError, match=f'{name}: cannot be written, for the disk is full'), bag:
+        bag.write_depth(1, 'camera', np.ones((120, 160), np.float32), Intrinsics(150, 150, 80, 60, 160, 120))
+    assert not list(tmp_path.iterdir())

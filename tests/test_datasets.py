@@ -4,6 +4,8 @@ import gzip
 import logging
 import multiprocessing
 import os
+import struct
+import zlib
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -393,5 +395,92 @@ def test_a_cache_too_small_for_one_shard_is_used_all_the_same(tmp_path):
     shards = DiskShards(opening, tmp_path / 'cache', 1, limit_gb=1e-6)
     try:
         assert [shards.read(number)['joints'].shape for number in (0, 1, 0)] == [(1, 16, 3)] * 3
+    finally:
+        shards.close()
+
+
+def test_a_cache_is_not_used_after_depth_images_were_replaced(tmp_path):
+    write_nyu(tmp_path / 'nyu', 'test', 2, np.random.default_rng(1))
+    write_icvl(tmp_path / 'icvl', np.random.default_rng(2))
+    write_msra(tmp_path / 'msra', np.random.default_rng(3))
+    images = {'nyu': 'test/depth_1_0000002.png', 'icvl': 'Depth/test_seq_1/image_0001.png',
+              'msra': 'P0/1/000001_depth.bin'}
+    for name, image in images.items():
+        before = open_dataset(name, 'test', tmp_path / name).fingerprint
+        assert open_dataset(name, 'test', tmp_path / name).fingerprint == before
+        path = tmp_path / name / image
+        path.write_bytes(path.read_bytes()[:-1] + b'x')
+        assert open_dataset(name, 'test', tmp_path / name).fingerprint != before
+
+
+def test_images_of_another_size_are_refused(tmp_path):
+    """They would be cropped somewhere else than where the hand is."""
+    write_nyu(tmp_path / 'nyu', 'test', 1, np.random.default_rng(1))
+    write_icvl(tmp_path / 'icvl', np.random.default_rng(2))
+    write_msra(tmp_path / 'msra', np.random.default_rng(3))
+    for name, image in (('nyu', 'test/depth_1_0000001.png'), ('icvl', 'Depth/test_seq_1/image_0000.png')):
+        path = str(tmp_path / name / image)
+        cv2.imwrite(path, cv2.imread(path, cv2.IMREAD_UNCHANGED)[::2, ::2])
+    path = tmp_path / 'msra/P0/1/000000_depth.bin'
+    path.write_bytes(np.array([640, 480], '<i4').tobytes() + path.read_bytes()[8:])
+    for name, sizes in (('nyu', '320x240 .* have 640x480'), ('icvl', '160x120 .* have 320x240'),
+                        ('msra', r'000000_depth\.bin has 640x480 .* have 320x240')):
+        with pytest.raises(DatasetError, match=sizes):
+            open_dataset(name, 'test', tmp_path / name).batch(torch.arange(1))
+
+
+def test_recorded_frames_without_a_joint_are_left_out(tmp_path, caplog):
+    write_icvl(tmp_path / 'icvl', np.random.default_rng(2))
+    path = tmp_path / 'icvl/test_seq_1.txt'
+    words = path.read_text().split()
+    words[3] = '0'  # the depth of the palm in the first frame
+    path.write_text(' '.join(words[:49]) + '\n' + ' '.join(words[49:]) + '\n')
+    joints = write_nyu(tmp_path / 'nyu', 'test', 3, np.random.default_rng(1))
+    joints[1, 0] = np.nan
+    savemat(tmp_path / 'nyu/test/joint_data.mat', {'joint_xyz': np.stack([joints * (1000, -1000, 1000)] * 3)})
+    assert [open_dataset(name, 'test', tmp_path / name).size for name in ('icvl', 'nyu')] == [2, 2]
+    assert 'icvl-test: 1 of 3 hands have a joint that is not finite' in caplog.text
+    assert 'nyu-test: 1 of 3 hands' in caplog.text
+    assert torch.isfinite(open_dataset('nyu', 'test', tmp_path / 'nyu').batch(torch.arange(2))['joints']).all()
+
+
+def test_other_damage_of_recorded_datasets_is_one_sentence(tmp_path):
+    write_nyu(tmp_path / 'nyu', 'test', 2, np.random.default_rng(1))
+    with pytest.raises(DatasetError, match='no labelled frame of test_2 among its 2'):
+        open_dataset('nyu', 'test_2', tmp_path / 'nyu')
+    savemat(tmp_path / 'nyu/test/joint_data.mat', {'joint_xyz': np.zeros((3, 36, 2))})
+    with pytest.raises(DatasetError, match=r'joint_data\.mat is damaged .* shape \(36, 2\)'):
+        open_dataset('nyu', 'test', tmp_path / 'nyu')
+    write_icvl(tmp_path / 'icvl', np.random.default_rng(2))
+    lines = [line for line in (tmp_path / 'icvl/labels.txt').read_text().splitlines() if '20140515' not in line]
+    (tmp_path / 'icvl/labels.txt').write_text('\n'.join(lines))
+    with pytest.raises(DatasetError, match='sequence 201403121135, which validates'):
+        open_dataset('icvl', 'train', tmp_path / 'icvl')
+    (tmp_path / 'icvl/labels.txt').write_bytes(gzip.compress(b'201403121135/image_0000.png'))
+    with pytest.raises(DatasetError, match='is not text; is it packed'):
+        open_dataset('icvl', 'train', tmp_path / 'icvl')
+    huge = tmp_path / 'icvl/Depth/test_seq_1/image_0000.png'
+    header = b'IHDR' + struct.pack('>IIBBBBB', 65536, 32768, 16, 0, 0, 0, 0)
+    huge.write_bytes(b'\x89PNG\r\n\x1a\n' + struct.pack('>I', 13) + header + struct.pack('>I', zlib.crc32(header)))
+    with pytest.raises(DatasetError, match=r'image_0000\.png is damaged'):
+        open_dataset('icvl', 'test', tmp_path / 'icvl').frame(0)
+
+
+def test_a_shared_cache_can_be_read_by_others_and_what_cannot_be_read_is_kept(tmp_path, monkeypatch):
+    write_icvl(tmp_path / 'icvl', np.random.default_rng(5))
+    shards = DiskShards(partial(open_dataset, 'icvl', 'test', tmp_path / 'icvl'), tmp_path / 'cache', 1)
+    (tmp_path / 'usual').touch()
+    try:
+        shards.read(0)
+        assert shards.path(0).stat().st_mode == (tmp_path / 'usual').stat().st_mode
+
+        def refuse(*_):
+            raise PermissionError(13, 'Permission denied')
+
+        monkeypatch.setattr('hand_pose_ros.datasets.shards.os.open', refuse)
+        shards.keep([])
+        with pytest.raises(DatasetError, match=r'000000\.safetensors cannot be read \(Permission denied\)'):
+            shards.read(0)
+        assert shards.path(0).exists()
     finally:
         shards.close()

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import nn
 
@@ -31,13 +32,14 @@ from hand_pose_ros.models.prior import fit_prior
 from hand_pose_ros.skeleton import HAND21, Skeleton, get_skeleton
 from hand_pose_ros.training import experiments
 from hand_pose_ros.training.augmentation import PRESETS, Augmentation, augment
-from hand_pose_ros.training.folder import TrainingError
+from hand_pose_ros.training.folder import RunFolder, TrainingError
 from hand_pose_ros.training.gradients import Gradients
 from hand_pose_ros.training.loop import Machine, Run
 from hand_pose_ros.training.losses import joint_loss
 from hand_pose_ros.training.objectives import objective_for
 from hand_pose_ros.training.optimizers import learning_rate, make_optimizer, orthogonal
 from hand_pose_ros.training.recipes import RECIPES, get_recipe, recipe_from_dict, recipe_to_dict
+from hand_pose_ros.training.state import save_tensors
 from hand_pose_ros.training.stream import SampleStream
 
 TINY = ('dataset=icvl', 'network=shallow', 'options.bottleneck=8', 'batch_size=4', 'shard_size=4', 'val_every=40',
@@ -460,6 +462,46 @@ def test_a_signal_does_not_wait_for_samples_and_the_run_continues_bit_for_bit(fo
         run.train()
     tiny(folder, 'samples=40', out=tmp_path / 'stopped').train(resume=True)
     assert same_state(tmp_path / 'whole', tmp_path / 'stopped')
+
+
+def test_one_folder_is_trained_in_by_one_process_at_a_time(folder, tmp_path):
+    first = tiny(folder, 'samples=8', out=tmp_path / 'run')
+    first.folder.lock()
+    for resume in (False, True):
+        with pytest.raises(TrainingError, match=r'run: another process trains in this folder'):
+            tiny(folder, 'samples=8', 'seed=5', out=tmp_path / 'run').train(resume)
+    first.train()  # in which it may lock once more
+    assert json.loads((tmp_path / 'run' / 'config.json').read_text())['recipe']['seed'] == first.recipe.seed
+
+
+def test_a_run_goes_on_from_another_folder(folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(folder.parent)
+    recipe = get_recipe('paper', [f'root={folder.name}', 'base=hand_dense', 'first=nothing/here'])
+    assert (recipe.root, recipe.base, recipe.first) == (str(folder.resolve()), 'hand_dense', 'nothing/here')
+
+
+def test_tensorboard_forgets_what_a_killed_run_showed_after_its_state(tmp_path):
+    pytest.importorskip('tensorboard')
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+    for step, shown in ((0, (4, 8, 12)), (2, (12, 16))):  # killed after 12 samples, with the state of 8
+        run = RunFolder(tmp_path)
+        run.open(step, 4 * step)
+        for samples in shown:
+            run.write({'step': samples // 4, 'samples': samples, 'loss': float(step)})
+        run.close()
+    events = EventAccumulator(str(tmp_path))
+    events.Reload()
+    assert [(one.step, one.value) for one in events.Scalars('loss')] == [(4, 0), (8, 0), (12, 2), (16, 2)]
+
+
+def test_a_full_disk_is_told_of_with_the_file(tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise SafetensorError('Error while serializing: I/O error: No space left on device (os error 28)')
+
+    monkeypatch.setattr('hand_pose_ros.training.state.save_file', full)
+    with pytest.raises(HandPoseError, match=r'x\.safetensors: cannot be written, for the disk is full: make room'):
+        save_tensors(tmp_path / 'x.safetensors', {'a': torch.zeros(1)}, {})
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_run_that_was_stopped_in_its_last_validation_does_it_when_resumed(folder, tmp_path):

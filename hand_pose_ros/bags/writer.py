@@ -6,6 +6,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from hand_pose_ros.bags.bag import CAMERA_INFO, COMPRESSED_IMAGE, HAND, HANDS, I
 from hand_pose_ros.conventions import camera_info_beside, join_transport
 from hand_pose_ros.depth import encode_compressed, to_units
 from hand_pose_ros.errors import InputError
+from hand_pose_ros.files import naming_full_disk
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.hand import HandEstimate
 from hand_pose_ros.markers import Marker
@@ -71,6 +73,10 @@ class BagWriter:
             stamp_ns: time of recording.
             latched: players offer the topic as transient local.
         """
+        with naming_full_disk(self.path):
+            self._write(topic, msgtype, data, stamp_ns, latched)
+
+    def _write(self, topic: str, msgtype: str, data: bytes | memoryview, stamp_ns: int, latched: bool) -> None:
         if topic not in self._connections:
             qos = Qos(QosHistory.KEEP_LAST, 1 if latched else 10, QosReliability.RELIABLE,
                       QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE,
@@ -126,14 +132,16 @@ class BagWriter:
         """Complete the bag and move it into place."""
         made = self._writer.path
         try:
-            self._writer.close()
+            with naming_full_disk(self.path):
+                self._writer.close()
             os.replace(next(made.glob(f'*{self.path.suffix}')) if self._is_file else made, self.path)
         finally:
             shutil.rmtree(self._work, ignore_errors=True)
 
     def abort(self) -> None:
         """Give the bag up and leave nothing."""
-        self._writer.abort()
+        with suppress(Exception):  # a full disk, of which has been told
+            self._writer.abort()
         shutil.rmtree(self._work, ignore_errors=True)
 
     def __enter__(self) -> BagWriter:

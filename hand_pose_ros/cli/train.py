@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from hand_pose_ros.cli.arguments import count, none_or_more
+from hand_pose_ros.files import check_writable
 
 DESCRIPTION = """\
 Train a network from a recipe, on synthetic hands or a recorded dataset. This may take hours: Ctrl-C stops
@@ -86,6 +87,7 @@ def run(args: argparse.Namespace) -> int:
     folder = RunFolder(args.out)
     if not args.resume:
         folder.require_none()  # now, not after the first samples were made
+        check_writable(folder.state)
     recipe = folder.recipe() if args.resume else get_recipe(args.recipe, args.overrides)
     with logging_redirect_tqdm(), process_group(args.device):
         training = Run(args.out, recipe, machine(args))

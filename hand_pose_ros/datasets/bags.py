@@ -10,7 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from hand_pose_ros.bags.reader import DepthBag, Frame, RecordedHands, check_frame, read_hands
-from hand_pose_ros.datasets.base import DatasetError, LabelledFrame, RecordedDataset, fingerprint
+from hand_pose_ros.datasets.base import (
+    DatasetError,
+    LabelledFrame,
+    RecordedDataset,
+    are_labelled,
+    fingerprint,
+    states,
+    tell_left_out,
+)
 from hand_pose_ros.skeleton import Skeleton, get_skeleton
 
 log = logging.getLogger(__name__)
@@ -79,18 +87,13 @@ def _read(bag: Path) -> list[_Sample]:
     samples: list[_Sample] = []
     count = 0
     for hands in sorted(read_hands(bag), key=lambda hands: hands.stamp_ns):
-        # As in evaluation, a joint that is not finite or not in front of the camera is not labelled.
-        whole = np.isfinite(hands.joints).all((1, 2)) & (hands.joints[..., 2] > 0).all(1)
-        samples += [(bag, hands, i) for i in np.flatnonzero(whole).tolist()]
+        samples += [(bag, hands, i) for i in np.flatnonzero(are_labelled(hands.joints)).tolist()]
         count += len(hands.joints)
+    tell_left_out(f'bags: {bag}', count - len(samples), count)
     sideless = sum(hands.sides[i] == 'unknown' for _, hands, i in samples)
-    if multiprocessing.parent_process() is None:  # those that make samples need not say it again
-        if len(samples) < count:
-            log.warning('bags: %s: %s of %s hands have a joint that is not finite or not in front of the camera, and '
-                        'are left out', bag, count - len(samples), count)
-        if sideless:
-            log.warning('bags: %s: the side of %s of %s hands is unknown, and they are taken for right hands: write '
-                        'the side of those that are left ones', bag, sideless, len(samples))
+    if sideless and multiprocessing.parent_process() is None:
+        log.warning('bags: %s: the side of %s of %s hands is unknown, and they are taken for right hands: write '
+                    'the side of those that are left ones', bag, sideless, len(samples))
     return samples
 
 
@@ -100,6 +103,5 @@ def _images(bag: Path) -> Iterator[Frame]:
 
 
 def _contents(bag: Path) -> bytes:
-    """Changes with the depth and the cameras in a bag, of which reading every byte would take minutes."""
-    files = sorted(path for path in bag.rglob('*') if path.is_file()) if bag.is_dir() else [bag]
-    return ''.join(f'{path.name}{path.stat().st_size}-{path.stat().st_mtime_ns}' for path in files).encode()
+    """Changes with the depth and the cameras in a bag."""
+    return states(sorted(path for path in bag.rglob('*') if path.is_file()) if bag.is_dir() else [bag])

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import logging
+import multiprocessing
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -19,6 +21,8 @@ import hand_pose_ros.geometry
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.geometry import Cube, Intrinsics, crop
 from hand_pose_ros.skeleton import Skeleton
+
+log = logging.getLogger(__name__)
 
 Batch = dict[str, Tensor]
 """Samples side by side, as the network sees them: left hands are mirrored, so that all are right hands.
@@ -150,6 +154,32 @@ def require(dataset: str, paths: Iterable[Path]) -> None:
                            'the folder described in docs/training.md?')
 
 
+def states(files: Iterable[Path]) -> bytes:
+    """Changes with the files, of which reading every byte would take minutes."""
+    return ''.join(f'{path.name}{state.st_size}-{state.st_mtime_ns}'
+                   for path, state in ((path, path.stat()) for path in files)).encode()
+
+
+def are_labelled(joints: NDArray[Any]) -> NDArray[np.bool_]:
+    """Which hands (N,) of joints (N, J, 3) have all of them; one not finite or not before the camera is no label."""
+    return np.isfinite(joints).all((1, 2)) & (joints[..., 2] > 0).all(1)
+
+
+def tell_left_out(source: object, left_out: int, count: int) -> None:
+    """Log how many hands of a dataset or bag are not used, but not once more in each process that makes samples."""
+    if left_out and multiprocessing.parent_process() is None:
+        log.warning('%s: %s of %s hands have a joint that is not finite or not in front of the camera, and are left '
+                    'out', source, left_out, count)
+
+
+def check_depth(dataset: str, path: Path, depth: NDArray[Any], intrinsics: Intrinsics) -> None:
+    """Raise DatasetError unless a depth image (H, W) is as large as those of the camera."""
+    (height, width), expected = depth.shape[:2], (intrinsics.width, intrinsics.height)
+    if (width, height) != expected:
+        raise DatasetError(f'{dataset}: {path} has {width}x{height} pixels, but the images of this dataset have '
+                           f'{expected[0]}x{expected[1]}; copy or download it as it is distributed')
+
+
 def read_depth(path: Path, dataset: str, channels: int = 1) -> NDArray[Any]:
     """A depth PNG as it is stored, (H, W) uint16 or, with 3 channels, (H, W, 3) uint8 blue, green, red.
 
@@ -159,7 +189,10 @@ def read_depth(path: Path, dataset: str, channels: int = 1) -> NDArray[Any]:
     data = np.fromfile(path, np.uint8) if path.is_file() else None
     if data is None:
         raise DatasetError(f'{dataset}: {path} is missing; is the download complete?')
-    image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+    try:
+        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+    except cv2.error:  # it claims to be larger than any image
+        image = None
     if image is None:
         raise DatasetError(f'{dataset}: {path} is damaged; copy or download it again')
     if (image.ndim, image.dtype) != ((2, np.uint16) if channels == 1 else (3, np.uint8)):

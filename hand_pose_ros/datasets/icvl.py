@@ -6,7 +6,18 @@ from pathlib import Path
 
 import numpy as np
 
-from hand_pose_ros.datasets.base import DatasetError, LabelledFrame, RecordedDataset, fingerprint, read_depth, require
+from hand_pose_ros.datasets.base import (
+    DatasetError,
+    LabelledFrame,
+    RecordedDataset,
+    are_labelled,
+    check_depth,
+    fingerprint,
+    read_depth,
+    require,
+    states,
+    tell_left_out,
+)
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.skeleton import get_skeleton
 
@@ -46,15 +57,23 @@ class ICVL(RecordedDataset):
                 raise DatasetError(f'ICVL: {lists[0]} lists no genuine frames (in folders named by date)')
             last = max(_sequence(path) for path, _ in frames)
             frames = [frame for frame in frames if (_sequence(frame[0]) == last) == (split == 'val')]
+            if not frames:
+                raise DatasetError(f'ICVL: all genuine frames of {lists[0]} are of the sequence {last}, which '
+                                   'validates: training needs another one')
+        whole = are_labelled(np.array([uvd for _, uvd in frames]).reshape(-1, 16, 3))
+        tell_left_out(self.name, int((~whole).sum()), len(whole))
         self._depth = lists[0].parent / 'Depth'
-        self._frames = frames
-        self.size = len(frames)
-        require('ICVL', (self._depth / path for path, _ in frames))
-        self.fingerprint = fingerprint(self.name, *(f'{path}{uvd.tolist()}'.encode() for path, uvd in frames))
+        self._frames = [frame for frame, usable in zip(frames, whole, strict=True) if usable]
+        self.size = len(self._frames)
+        images = [self._depth / path for path, _ in self._frames]
+        require('ICVL', images)
+        labels = (f'{path}{uvd.tolist()}'.encode() for path, uvd in self._frames)
+        self.fingerprint = fingerprint(self.name, states(images), *labels)
 
     def frame(self, index: int) -> LabelledFrame:
         path, uvd = self._frames[index]
         depth = (read_depth(self._depth / path, 'ICVL') / 1000).astype(np.float32)
+        check_depth('ICVL', self._depth / path, depth, INTRINSICS)
         joints = INTRINSICS.back_project(uvd[:, :2], uvd[:, 2] / 1000)
         return LabelledFrame(depth, INTRINSICS, joints, joints[PALM], self.cube_side)
 
@@ -75,7 +94,11 @@ def _sequence(path: str) -> str:
 def _read(path: Path) -> list[tuple[str, np.ndarray]]:
     """Image path and (16, 3) u, v in pixels and depth in mm, line by line; blank lines are skipped."""
     frames = []
-    for number, line in enumerate(path.read_text().splitlines(), 1):
+    try:
+        text = path.read_text()
+    except UnicodeDecodeError:
+        raise DatasetError(f'ICVL: {path} is not text; is it packed? unpack it, or download it again') from None
+    for number, line in enumerate(text.splitlines(), 1):
         words = line.split()
         if not words:
             continue

@@ -7,7 +7,17 @@ from pathlib import Path
 
 import numpy as np
 
-from hand_pose_ros.datasets.base import DatasetError, LabelledFrame, RecordedDataset, fingerprint, require
+from hand_pose_ros.datasets.base import (
+    DatasetError,
+    LabelledFrame,
+    RecordedDataset,
+    are_labelled,
+    check_depth,
+    fingerprint,
+    require,
+    states,
+    tell_left_out,
+)
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.skeleton import get_skeleton
 
@@ -53,13 +63,18 @@ class MSRA(RecordedDataset):
                                    'with --set root=FOLDER')
             for gesture in gestures:
                 self._frames += [(subject, *frame) for frame in _read_gesture(gesture)]
+        whole = are_labelled(np.array([joints for _, _, joints in self._frames]))
+        tell_left_out(self.name, int((~whole).sum()), len(whole))
+        self._frames = [frame for frame, usable in zip(self._frames, whole, strict=True) if usable]
         self.size = len(self._frames)
-        self.fingerprint = fingerprint(
-            self.name, *(f'{path}{joints.tolist()}'.encode() for _, path, joints in self._frames))
+        labels = (f'{path}{joints.tolist()}'.encode() for _, path, joints in self._frames)
+        self.fingerprint = fingerprint(self.name, states(path for _, path, _ in self._frames), *labels)
 
     def frame(self, index: int) -> LabelledFrame:
         subject, path, joints = self._frames[index]
-        return LabelledFrame(read_bin(path), INTRINSICS, joints, joints[SEED], CUBE_SIDES[subject])
+        depth = read_bin(path)
+        check_depth('MSRA', path, depth, INTRINSICS)
+        return LabelledFrame(depth, INTRINSICS, joints, joints[SEED], CUBE_SIDES[subject])
 
 
 def read_bin(path: Path) -> np.ndarray:
@@ -91,7 +106,7 @@ def _read_gesture(folder: Path) -> list[tuple[Path, np.ndarray]]:
         joints = np.array([line.split() for line in lines[1:] if line.strip()], np.float64).reshape(-1, 21, 3)
         if len(joints) != int(lines[0]):
             raise ValueError(f'{len(joints)} of {lines[0].strip()} lines')
-    except ValueError as error:
+    except ValueError as error:  # a UnicodeDecodeError is one
         raise DatasetError(f'MSRA: {labels} is damaged ({error}); copy or download it again') from error
     joints = joints * (0.001, -0.001, -0.001)  # mm, y up, z towards the viewer -> m, optical frame
     faulty = FAULTY.get((folder.parent.name, folder.name), set())

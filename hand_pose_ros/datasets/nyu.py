@@ -8,7 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.io import loadmat
 
-from hand_pose_ros.datasets.base import DatasetError, LabelledFrame, RecordedDataset, fingerprint, read_depth, require
+from hand_pose_ros.datasets.base import (
+    DatasetError,
+    LabelledFrame,
+    RecordedDataset,
+    are_labelled,
+    check_depth,
+    fingerprint,
+    read_depth,
+    require,
+    states,
+    tell_left_out,
+)
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.skeleton import get_skeleton
 
@@ -53,20 +64,26 @@ class NYU(RecordedDataset):
         require('NYU', [labels])
         try:
             joints = np.asarray(loadmat(labels, variable_names=['joint_xyz'])['joint_xyz'][0])  # of camera 1
-            joints = joints[:, JOINTS]
+            if joints.ndim != 3 or joints.shape[1] <= max(JOINTS) or joints.shape[2] != 3:
+                raise ValueError(f'joint_xyz has the shape {joints.shape}')
+            self._joints = joints[:, JOINTS] * (0.001, -0.001, 0.001)  # mm with y up -> m with y down
         except Exception as error:  # scipy raises what it likes on a damaged file
             raise DatasetError(f'NYU: {labels} is damaged or has no joint_xyz ({error}); download it again') from error
-        self._joints = joints * (0.001, -0.001, 0.001)  # mm with y up -> m with y down
         count = len(joints)
         held_out = max(1, round(count * HELD_OUT))
         parts = {'train': range(count - held_out), 'val': range(count - held_out, count), 'test': range(count),
                  'test_1': range(min(FIRST_SUBJECT, count)), 'test_2': range(FIRST_SUBJECT, count)}
         if split not in parts:
             raise DatasetError(f"NYU: unknown split '{split}': choose one of {', '.join(parts)}")
-        self._frames = parts[split]
+        whole = are_labelled(self._joints)
+        self._frames = [frame for frame in parts[split] if whole[frame]]
+        if not self._frames:
+            raise DatasetError(f'NYU: {labels} has no labelled frame of {split} among its {count}; is it complete?')
+        tell_left_out(self.name, len(parts[split]) - len(self._frames), len(parts[split]))
         self.size = len(self._frames)
-        require('NYU', (self._path(frame) for frame in self._frames))
-        self.fingerprint = fingerprint(self.name, self._joints.tobytes())
+        files = [self._path(frame) for frame in self._frames]
+        require('NYU', files)
+        self.fingerprint = fingerprint(self.name, self._joints.tobytes(), states(files))
 
     def _path(self, frame: int) -> Path:
         return self._folder / f'depth_1_{frame + 1:07d}.png'
@@ -74,6 +91,7 @@ class NYU(RecordedDataset):
     def frame(self, index: int) -> LabelledFrame:
         frame = self._frames[index]
         depth = read_nyu_depth(self._path(frame))
+        check_depth('NYU', self._path(frame), depth, INTRINSICS)
         joints = self._joints[frame]
         smaller = self._folder.name == 'test' and frame >= FIRST_SUBJECT
         # The factor is the original authors' knowledge of the subject's hand: say so with every number that uses it.

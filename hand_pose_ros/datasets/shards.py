@@ -8,10 +8,8 @@ from __future__ import annotations
 import hashlib
 import logging
 import multiprocessing
-import multiprocessing.connection
 import os
 import signal
-import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -26,6 +24,8 @@ from safetensors.torch import save_file
 
 from hand_pose_ros.datasets.base import Batch, Dataset, DatasetError
 from hand_pose_ros.datasets.memory import keep_freed_memory
+from hand_pose_ros.files import in_one_step
+from hand_pose_ros.processes import leave_with_parent
 
 log = logging.getLogger(__name__)
 
@@ -123,6 +123,9 @@ class DiskShards:
             try:
                 tensors = read_shard(self.path(shard), check=not fresh)
                 self._open[shard] = {key: value.to(self._device) for key, value in tensors.items()}
+            except PermissionError as error:  # made by another user: not ours to make again
+                raise DatasetError(f'{self.path(shard)} cannot be read ({error.strerror}): correct its permissions, or '
+                                   'choose another --cache') from None
             except (FileNotFoundError, DatasetError):  # not made yet, deleted to make room, or damaged: make it
                 self.path(shard).unlink(missing_ok=True)
                 self.keep([*self._open, shard])
@@ -146,7 +149,7 @@ class DiskShards:
             worker.kill()
         pool.shutdown(wait=True, cancel_futures=True)
         for worker in workers:
-            for path in self._folder.glob(f'*.{worker.pid}.tmp'):
+            for path in self._folder.glob(f'.*.{worker.pid}.part'):
                 path.unlink()
 
 
@@ -155,8 +158,10 @@ def read_shard(path: Path, check: bool = True) -> Batch:
 
     Raises:
         FileNotFoundError: there is no such file.
+        PermissionError: it may not be read.
         DatasetError: the file is damaged.
     """
+    os.close(os.open(path, os.O_RDONLY))  # safetensors takes a file that may not be read for missing
     try:
         with safe_open(path, 'pt') as file:
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
@@ -185,14 +190,7 @@ def _start_worker(open_dataset: Callable[[], Dataset], shard_size: int, root: Pa
     global _worker
     torch.set_num_threads(1)
     keep_freed_memory()
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def leave_with_parent() -> None:
-        multiprocessing.connection.wait([parent.sentinel])
-        os._exit(1)
-
-    threading.Thread(target=leave_with_parent, daemon=True).start()
+    leave_with_parent()
     _worker = open_dataset(), shard_size, root, limit
 
 
@@ -203,9 +201,8 @@ def _make_file(shard: int, path: Path) -> None:
         if path.exists():
             return
         tensors = {key: value.cpu().contiguous() for key, value in make_shard(dataset, shard, shard_size).items()}
-        temporary = path.with_suffix(f'.{os.getpid()}.tmp')
-        save_file(tensors, temporary, metadata={'sha256': _checksum(tensors)})
-        os.replace(temporary, path)
+        with in_one_step(path) as part:
+            save_file(tensors, part, metadata={'sha256': _checksum(tensors)})
     _limit_size(root, limit, path)
 
 

@@ -8,8 +8,10 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock, Timeout
+
 from hand_pose_ros.errors import HandPoseError
-from hand_pose_ros.files import write_bytes, write_json
+from hand_pose_ros.files import check_writable, write_bytes, write_json
 from hand_pose_ros.training.recipes import Recipe, recipe_from_dict, recipe_to_dict
 
 log = logging.getLogger(__name__)
@@ -23,7 +25,8 @@ class RunFolder:
     """Files of one run.
 
     config.json (recipe, git revision) · state.safetensors (to resume) · last.safetensors and best.safetensors
-    (checkpoints to use) · metrics.jsonl · log.txt · TensorBoard events, if it is installed.
+    (checkpoints to use) · metrics.jsonl · log.txt · TensorBoard events, if it is installed · .lock
+    (see `lock`).
     """
 
     def __init__(self, path: Path) -> None:
@@ -31,6 +34,7 @@ class RunFolder:
         self.state = path / 'state.safetensors'
         self._tensorboard: Any = None
         self._log: logging.Handler | None = None
+        self._lock = FileLock(path / '.lock')
 
     def checkpoint(self, name: str) -> Path:
         """'best' or 'last'."""
@@ -54,6 +58,20 @@ class RunFolder:
         if self.state.exists():
             raise TrainingError(f'{self.path} holds a run already: continue it with --resume, or choose another --out')
 
+    def lock(self) -> None:
+        """Keep others from writing here until `close`, or until this process ends.
+
+        Raises:
+            TrainingError: another process writes here.
+            InputError: the folder cannot be made or written.
+        """
+        check_writable(self.path / '.lock')
+        try:
+            self._lock.acquire(timeout=0)
+        except Timeout:
+            raise TrainingError(f'{self.path}: another process trains in this folder: wait for its end, or choose '
+                                'another --out') from None
+
     def create(self, recipe: Recipe) -> None:
         """Start a new run here.
 
@@ -61,11 +79,10 @@ class RunFolder:
             TrainingError: the folder holds a run already.
         """
         self.require_none()
-        self.path.mkdir(parents=True, exist_ok=True)
         write_json(self.path / 'config.json', {'recipe': recipe_to_dict(recipe), 'git': _git_revision()})
 
-    def open(self, step: int) -> None:
-        """Begin to write; what was written after this step of a run that goes on is written anew."""
+    def open(self, step: int, samples: int) -> None:
+        """Begin to write; what was written after this step, or so many samples, of a run that goes on is forgotten."""
         metrics = self.path / 'metrics.jsonl'
         if metrics.exists():
             lines = metrics.read_text().splitlines(keepends=True)
@@ -77,7 +94,7 @@ class RunFolder:
         logger.setLevel(logging.INFO)
         try:
             from torch.utils.tensorboard import SummaryWriter
-            self._tensorboard = SummaryWriter(str(self.path))
+            self._tensorboard = SummaryWriter(str(self.path), purge_step=samples + 1 if step else None)
         except ImportError:
             log.info('no events for TensorBoard: it is not installed')
 
@@ -90,6 +107,8 @@ class RunFolder:
                 self._tensorboard.add_scalar(name, value, values['samples'])
 
     def close(self) -> None:
+        """End writing, and let others write."""
+        self._lock.release()
         if self._tensorboard is not None:
             self._tensorboard.close()
         if self._log is not None:

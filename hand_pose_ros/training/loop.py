@@ -160,6 +160,8 @@ class Run:
                 self.folder.close()
 
     def _begin(self, resume: bool) -> None:
+        if self.rank == 0:
+            self.folder.lock()
         if resume:
             progress = load_state(self.folder.state, self._modules(), self.optimizer)
             self.step, self.best_mm = progress['step'], progress['best_mm'] or float('inf')
@@ -171,7 +173,7 @@ class Run:
         elif self.rank == 0:
             self.folder.create(self.recipe)
         if self.rank == 0:
-            self.folder.open(self.step)
+            self.folder.open(self.step, self.step * self.recipe.batch_size)
             log.info('%s on %s, step %s of %s, %s samples each; the recipe is in %s/config.json', self.recipe.network,
                      self.shards.dataset.name, self.step, self.steps, self.recipe.batch_size, self.folder.path)
 

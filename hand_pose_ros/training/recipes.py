@@ -7,9 +7,11 @@ import dataclasses
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, TypeVar
 
 from hand_pose_ros.errors import HandPoseError
+from hand_pose_ros.models.checkpoints import available
 from hand_pose_ros.training.augmentation import PRESETS, Augmentation
 
 MAX_SEED = 1 << 22
@@ -128,7 +130,16 @@ def get_recipe(name: str, overrides: Iterable[str] = ()) -> Recipe:
         if not equals:
             raise HandPoseError(f'--set {item}: write it as key=value')
         recipe = _replace(recipe, key.split('.'), text, item)
-    return recipe
+    # So that the run can go on from another folder.
+    return dataclasses.replace(recipe, base=_absolute(recipe.base), first=_absolute(recipe.first),
+                               root=_absolute(recipe.root))
+
+
+def _absolute(path: str | None) -> str | None:
+    """The same file or folder wherever one is; a name of weights that ship stays one."""
+    if path is None or path in available() or not (there := Path(path).expanduser()).exists():
+        return path
+    return str(there.resolve())
 
 
 def recipe_to_dict(recipe: Recipe) -> dict[str, Any]:

@@ -101,7 +101,12 @@ def encode_compressed(
     Args:
         depth: (H, W) in metres, 0 = no reading; see `to_units` for what 16 bits can hold.
         codec: 'png' (smaller) or 'rvl' (faster to decode in C++ players).
+
+    Raises:
+        InputError: another codec.
     """
+    if codec not in ('png', 'rvl'):
+        raise InputError(f"unknown codec '{codec}': choose png or rvl")
     units = to_units(depth, depth_scale)
     payload = encode_rvl(units) if codec == 'rvl' else encode_png(units)
     return f'16UC1; compressedDepth {codec}', _HEADER.pack(-1, 0.0, 0.0) + payload
@@ -135,7 +140,8 @@ def depth_problem(depth: NDArray[np.float32], near: float, far: float, scale_is_
     if outside < MAX_OUTSIDE or scale_is_right:
         return ''
     return (f'{outside:.0%} of the depth is outside {near:g} to {far:g} m (median {float(np.median(readings)):.3g} m): '
-            'check depth_scale (0.001 for most cameras, 0.000125 for a RealSense SR305), or the range')
+            'check depth_scale (0.001 for most cameras, 0.000125 for a RealSense SR305; 32FC1 has none, but must be '
+            'metres), or the range')
 
 
 def to_metres(units: NDArray[np.uint16], depth_scale: float = 0.001) -> NDArray[np.float32]:

@@ -8,6 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
 from hand_pose_ros.bags import Bag, BagWriter, DepthBag, read_hands
@@ -330,6 +332,26 @@ def test_a_bag_appears_only_when_it_is_complete(tmp_path, depths):
     (tmp_path / 'folder').mkdir()
     with pytest.raises(InputError, match='something already'):
         BagWriter(tmp_path / 'folder')
+
+
+@pytest.mark.parametrize('storage', ['MCAP', 'SQLITE3'])
+def test_messages_that_are_compressed_one_by_one_need_their_folder(tmp_path, storage):
+    plain, packed = tmp_path / 'plain.mcap', tmp_path / 'packed'
+    with BagWriter(plain) as bag:
+        bag.write_depth(STAMPS[0], 'camera', np.ones((48, 64), np.float32), CAMERA, codec=None)
+    writer = Writer2(packed, version=9, storage_plugin=StoragePlugin[storage])
+    writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+    with writer, Bag(plain) as bag:
+        topics = {connection.topic: writer.add_connection(connection.topic, connection.msgtype, typestore=typestore())
+                  for connection in bag.connections}
+        for connection, stamp, data in bag.messages(bag.connections):
+            writer.write(topics[connection.topic], stamp, data)
+    with DepthBag(packed) as bag:
+        assert len([frame.depth for frame in bag]) == 1
+    file = next(path for path in packed.iterdir() if path.suffix in ('.mcap', '.db3'))
+    with pytest.raises(InputError, match=r'its messages are compressed, .*: give the folder'), \
+            DepthBag(file) as bag:
+        list(bag)
 
 
 @pytest.mark.parametrize('name', ['x.mcap', 'x.db3', 'folder'])

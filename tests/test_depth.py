@@ -119,6 +119,11 @@ def test_png_without_header(units, form):
     np.testing.assert_array_equal(depth, decode_image(image(units)))
 
 
+def test_other_codecs_are_refused():
+    with pytest.raises(InputError, match="unknown codec 'jpg'"):
+        encode_compressed(np.ones((4, 4), np.float32), 'jpg')
+
+
 @pytest.mark.parametrize('codec', ['png', 'rvl'])
 def test_what_is_compressed_comes_back(units, codec):
     depth = units * np.float32(0.001)

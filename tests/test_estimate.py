@@ -1,6 +1,7 @@
 """What `hand-pose estimate` promises: every usable image answered, in files that hold what the estimator said."""
 
 import shutil
+import subprocess
 import sys
 from types import SimpleNamespace
 
@@ -309,6 +310,47 @@ def test_a_contact_sheet_is_read_like_text():
     sheet = contact_sheet([np.full((2, 3, 3), value, np.uint8) for value in (50, 100, 150)], columns=2)
     assert sheet.shape == (4, 6, 3)
     assert (sheet[0, 0, 0], sheet[0, 3, 0], sheet[2, 0, 0]) == (50, 100, 150)
+
+
+def test_nothing_is_added_to_the_folder_of_an_interrupted_recording(bag, tmp_path, command, capsys):
+    (folder := tmp_path / 'recording').mkdir()
+    shutil.copy(bag, folder / 'recording_0.mcap')  # and no metadata.yaml
+    assert command(folder, '--out', folder / 'joints.mcap') == 1
+    assert 'joints.mcap: this is the input, which would be lost' in capsys.readouterr().err
+    assert command(folder, '--out', folder / 'joints.npz') == 0
+
+
+def test_another_recording_is_not_replaced(bag, tmp_path, command, capsys):
+    other = tmp_path / 'other.mcap'
+    shutil.copy(bag, other)
+    assert command(bag, '--out', other) == 1
+    assert 'other.mcap: this is a recording of /' in capsys.readouterr().err
+    assert other.read_bytes() == bag.read_bytes()
+    assert [command(bag, '--out', tmp_path / 'hands.mcap') for _ in range(2)] == [0, 0]
+
+
+def test_topics_are_for_bags(folder, command, capsys):
+    with pytest.raises(SystemExit):
+        command(folder, *INTRINSICS, '--depth-topic', '/depth', '--out', folder / 'x.npz')
+    assert '--depth-topic is for bags: PNGs have no topics' in capsys.readouterr().err
+
+
+def test_sigterm_leaves_nothing_half_made(bag, tmp_path, weights):
+    out = tmp_path / 'out'
+    out.mkdir()
+    code = """
+import os, signal, sys
+from hand_pose_ros.cli import estimate, main
+add = estimate.HandBag.add
+def stopped(*arguments):
+    add(*arguments)
+    os.kill(os.getpid(), signal.SIGTERM)
+estimate.HandBag.add = stopped
+sys.exit(main(sys.argv[1:]))"""
+    done = subprocess.run([sys.executable, '-c', code, 'estimate', str(bag), '--model', str(weights), '--out',
+                           str(out / 'x.mcap')], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 1 and 'estimate: interrupted' in done.stderr
+    assert not list(out.iterdir())
 
 
 @pytest.mark.parametrize('kind', ['bag', 'folder', 'png'])

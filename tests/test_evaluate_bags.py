@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -331,6 +332,7 @@ def test_processes_of_torchrun_share_the_bags(tmp_path, bag, model):
 def test_the_live_node_answers_what_the_estimator_says(ros_domain, tmp_path, model, settings):
     pytest.importorskip('rclpy', reason='ROS is not installed')
     bag = record(tmp_path / 'slow.mcap', frames=8, step_ns=200_000_000)
+    model = str(shutil.copy(model, tmp_path / "a: b's #1, [x] {y}.safetensors"))  # as YAML many things, but not a name
     assert main(arguments(bag, model, '--via-ros', '--json', tmp_path / 'r.json', '--out', tmp_path / 'r.npz')) == 0
     got, live = json.loads((tmp_path / 'r.json').read_text()), Result.load(tmp_path / 'r.npz').predictions
     answered = np.isfinite(live).all((1, 2))

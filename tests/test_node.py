@@ -298,6 +298,17 @@ def test_compressed_depth(rig: Rig) -> None:
     rig.answer(publish, message)
 
 
+def test_a_topic_may_be_named_with_its_transport(rig: Rig) -> None:
+    """As `ros2 topic list` shows it."""
+    rig.start('depth/image_rect:=/a/b/compressedDepth', transport='compressedDepth')
+    publish = rig.camera(kind=CompressedImage, topic='/a/b/compressedDepth')
+    infos = rig.client.create_publisher(CameraInfo, '/a/camera_info', RELIABLE)
+    rig.connected(infos)
+    infos.publish(camera_info())
+    layout, data = encode_compressed(depth_with_hand())
+    assert len(rig.answer(publish, stamped(CompressedImage(format=layout, data=array('B', data)), 5, 'x')).hands) == 1
+
+
 def test_a_remapped_image_takes_its_camera_info_along(rig: Rig) -> None:
     rig.start('depth/image_rect:=/front/depth/image_raw')
     publish = rig.camera(topic='/front/depth/image_raw')

@@ -90,6 +90,9 @@ class Bag:
         try:
             return self._reader.deserialize(data, connection.msgtype)
         except Exception as error:  # whatever random bytes provoke
+            if bytes(data[:4]) == b'\x28\xb5\x2f\xfd':  # of zstd; only metadata.yaml tells that messages are compressed
+                raise InputError(f'{self.path}: its messages are compressed, as metadata.yaml says: give the folder '
+                                 'that holds both, or make it anew with: ros2 bag reindex FOLDER') from error
             raise InputError(f'{self.path}: a message on {connection.topic} is damaged ({error}): record or copy '
                              'the bag again') from error
 

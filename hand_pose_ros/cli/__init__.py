@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import NoReturn
 
 from hand_pose_ros import __version__
@@ -39,6 +41,23 @@ class _Parser(argparse.ArgumentParser):
         self.exit(2, f'{self.prog}: {message} (--help says what can be given)\n')
 
 
+@contextmanager
+def _ending_like_ctrl_c() -> Iterator[None]:
+    """SIGTERM, too, leaves nothing half-made behind. Training and the node have handlers of their own meanwhile."""
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    try:
+        before = signal.signal(signal.SIGTERM, stop)
+    except ValueError:  # not in the main thread
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb and return the exit code."""
     argv = list(sys.argv[1:] if argv is None else argv)
@@ -63,7 +82,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         hint = f'; {module.HINT}' if hasattr(module, 'HINT') else ''
         args.parser.error(f'unrecognized arguments: {" ".join(unknown)}{hint}')
     try:
-        return module.run(args)
+        with _ending_like_ctrl_c():
+            return module.run(args)
     except HandPoseError as error:
         print(f'hand-pose {args.verb}: {error}', file=sys.stderr)
         return 1

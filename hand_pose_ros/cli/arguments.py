@@ -29,10 +29,18 @@ def share(text: str) -> float:
 
 
 def metres(text: str) -> float:
-    """More than 0 and at most 1, as the side of a cube and the unit of depth are."""
+    """More than 0 and at most 1, as the unit of depth is."""
     value = float(text)
     if not 0 < value <= 1:
         raise argparse.ArgumentTypeError(f'{text} is not more than 0 and at most 1 (metres)')
+    return value
+
+
+def cube(text: str) -> float:
+    """0.05 to 1 m, as the node takes it."""
+    value = float(text)
+    if not 0.05 <= value <= 1:
+        raise argparse.ArgumentTypeError(f'{text} is not between 0.05 and 1 (metres)')
     return value
 
 
@@ -45,12 +53,14 @@ def none_or_more(text: str) -> int:
 
 
 def keep_input(output: str | Path | None, source: str | Path | None) -> None:
-    """Raise HandPoseError if an output would replace the input, or a file of a bag that is a folder; None is no file.
+    """Raise HandPoseError if an output would replace the input, or become a file of a bag that is a folder; None is no
+    file.
     """
-    if not (output and source and Path(output).exists() and Path(source).exists()):
+    if not (output and source and Path(source).exists()):
         return
     inside = Path(source).resolve() == Path(output).resolve().parent
-    if Path(output).samefile(source) or (inside and Path(output).suffix in ('.mcap', '.db3', '.yaml')):
+    same = Path(output).exists() and Path(output).samefile(source)
+    if same or (inside and Path(output).suffix in ('.mcap', '.db3', '.yaml')):
         raise HandPoseError(f'{output}: this is the input, which would be lost: choose another place')
 
 
@@ -107,7 +117,7 @@ def add_estimator(parser: Any) -> None:
     parser.add_argument('--side', default='auto', choices=('auto', 'left', 'right'), help='which hand it is (auto)')
     parser.add_argument('--detector', default='network', choices=('network', 'nearest'),
                         help='how hands are found: by a network, or as what is nearest to the camera (network)')
-    parser.add_argument('--cube-size', type=metres, metavar='M', help='side of the cube around a hand, metres')
+    parser.add_argument('--cube-size', type=cube, metavar='M', help='side of the cube around a hand, metres')
     parser.add_argument('--min-score', type=share, metavar='S', help='leave out hands below this score (0.4)')
 
 

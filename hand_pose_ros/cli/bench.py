@@ -49,12 +49,14 @@ def run(args: argparse.Namespace) -> int:
     import torch
 
     from hand_pose_ros import __version__
-    from hand_pose_ros.files import write_json
+    from hand_pose_ros.files import check_writable, write_json
     from hand_pose_ros.models.checkpoints import load_checkpoint
-    from hand_pose_ros.runtime import default_threads
+    from hand_pose_ros.runtime import default_threads, make_engine
 
+    if args.json:  # now, not after minutes of work
+        check_writable(args.json)
     if args.model:
-        load_checkpoint(args.model)  # now, not after minutes of work
+        make_engine(load_checkpoint(args.model).network, 'cpu', 1)
     threads = args.threads or default_threads()
     torch.set_num_threads(threads)
     torch.manual_seed(0)

@@ -26,6 +26,7 @@ from hand_pose_ros.cli.arguments import (
     count,
     estimator_options,
     keep_input,
+    refuse,
 )
 from hand_pose_ros.cli.hand_bag import HandBag
 from hand_pose_ros.depth import depth_problem, read_png
@@ -156,6 +157,7 @@ def _open(args: argparse.Namespace, stack: ExitStack) -> tuple[Iterator[DepthInp
     if paths:
         if args.intrinsics is None:
             args.parser.error('PNGs come without a camera: give --intrinsics FX FY CX CY')
+        refuse(args, ('depth_topic', 'camera_info_topic'), 'is for bags: PNGs have no topics')
         check_intrinsics(args)
         return _from_pngs(paths, args.intrinsics, args.depth_scale or 0.001), len(paths)
     bag = stack.enter_context(DepthBag(args.input, **bag_options(args)))

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from os import PathLike
+from pathlib import Path
 from typing import Any, Protocol
 
-from hand_pose_ros.bags import BagWriter
+from hand_pose_ros.bags import Bag, BagWriter
+from hand_pose_ros.errors import InputError
 from hand_pose_ros.hand import HandEstimate
 from hand_pose_ros.markers import HandMarkers
 from hand_pose_ros.skeleton import Skeleton
+
+TOPICS = ('/hand/joints', '/hand/markers', '/hand/skeleton')
 
 
 class Stamped(Protocol):
@@ -29,13 +34,14 @@ class HandBag:
         metadata: of the estimator; tells the model.
 
     Raises:
-        InputError: the bag cannot be written.
+        InputError: the bag cannot be written, or would replace one with other topics.
     """
 
     def __init__(self, path: str | PathLike[str], skeleton: Skeleton, metadata: Mapping[str, Any]) -> None:
         self._skeleton, self._metadata = skeleton, metadata
         self._begun = False
         self._markers = HandMarkers(skeleton)
+        _keep_recording(Path(path))
         self._writer = BagWriter(path)
 
     def __enter__(self) -> HandBag:
@@ -52,3 +58,13 @@ class HandBag:
             self._begun = True
         self._writer.write_hands(image.stamp_ns, image.frame_id, hands, self._skeleton)
         self._writer.write_markers(image.stamp_ns, image.frame_id, self._markers.update(hands))
+
+
+def _keep_recording(path: Path) -> None:
+    """Raise InputError if there is a bag with anything else than what a HandBag writes, which would be lost."""
+    topics: set[str] = set()
+    if path.is_file():
+        with suppress(InputError), Bag(path) as bag:
+            topics = {connection.topic for connection in bag.connections} - set(TOPICS)
+    if topics:
+        raise InputError(f'{path}: this is a recording of {min(topics)}, which would be lost: choose another name')

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import struct
@@ -78,7 +79,7 @@ def play_through_node(bag: DepthBag, camera_info_topic: str | None = None,
     info = camera_info_topic or camera_info_beside(image)
     infos = {info} & {connection.topic for connection in bag.connections}
     arguments = [item for name, value in {'transport': transport, **(parameters or {})}.items()
-                 for item in ('-p', f'{name}:={value}')]
+                 for item in ('-p', f'{name}:={json.dumps(value)}')]  # YAML, in which 'a: b' must be quoted
     remappings = {'__ns': namespace, '/diagnostics': f'{namespace}/diagnostics', IMAGE: image, CAMERA_INFO: info}
     arguments += [item for name, topic in remappings.items() for item in ('-r', f'{name}:={topic}')]
     if ours := not rclpy.ok():

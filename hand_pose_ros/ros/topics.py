@@ -28,9 +28,12 @@ def input_topics(node: Node, transport: str) -> tuple[str, str]:
     """Resolved names of the depth image (with its transport) and of camera_info.
 
     A remapped image takes its camera_info along: unless that is remapped too, it is looked for beside the image, as
-    image_transport does. The compressed transports follow the name of the image as well.
+    image_transport does. The compressed transports follow the name of the image as well; a name that ends in one may be
+    given, too.
     """
     image, info = node.resolve_topic_name(IMAGE), node.resolve_topic_name(CAMERA_INFO)
+    if split_transport(image)[1] == transport:
+        image = split_transport(image)[0]
     if info == node.resolve_topic_name(CAMERA_INFO, only_expand=True):
         info = camera_info_beside(image)
     return join_transport(image, transport), info

@@ -61,7 +61,8 @@ class Rig:
         self._newest = self._sent = 0
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
-        threading.Thread(target=self._executor.spin, daemon=True).start()
+        self._thread = threading.Thread(target=self._executor.spin, daemon=True)
+        self._thread.start()
         self.process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
@@ -127,6 +128,7 @@ class Rig:
         if self.process is not None and self.process.poll() is None:
             self.process.kill()
         self._executor.shutdown()
+        self._thread.join(timeout=5)
         self.node.destroy_node()
 
     def _on_joints(self, hands: HandJointsArray) -> None:

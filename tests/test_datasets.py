@@ -477,6 +477,9 @@ def test_a_shared_cache_can_be_read_by_others_and_what_cannot_be_read_is_kept(tm
         def refuse(*_):
             raise PermissionError(13, 'Permission denied')
 
+        monkeypatch.setattr('hand_pose_ros.datasets.shards.os.utime', refuse)  # as on a file of another user
+        shards.keep([])
+        assert shards.read(0)['joints'].shape == (1, 16, 3)
         monkeypatch.setattr('hand_pose_ros.datasets.shards.os.open', refuse)
         shards.keep([])
         with pytest.raises(DatasetError, match=r'000000\.safetensors cannot be read \(Permission denied\)'):

@@ -170,7 +170,8 @@ def read_shard(path: Path, check: bool = True) -> Batch:
         raise DatasetError(f'{path} is damaged ({error}); delete it and it is made again') from error
     if check and checksum != _checksum(tensors):
         raise DatasetError(f'{path} does not match its checksum; delete it and it is made again')
-    os.utime(path)
+    with suppress(PermissionError):  # made by another user, who may have it deleted sooner
+        os.utime(path)
     return tensors
 
 

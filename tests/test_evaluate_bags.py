@@ -217,6 +217,13 @@ def test_a_label_is_for_one_image(tmp_path, model, settings, capsys):
     assert 'several labels have the stamp 0 ns' in capsys.readouterr().err
 
 
+def test_hands_of_one_bag_do_not_become_a_part_of_another(tmp_path, bag, model, capsys):
+    (folder := tmp_path / 'recording').mkdir()
+    shutil.copy(bag, folder / 'recording_0.mcap')
+    assert main(['evaluate', str(folder), *arguments(bag, model, '--out-bag', folder)[1:]]) == 1
+    assert 'ball.mcap: this is the input, which would be lost' in capsys.readouterr().err
+
+
 def test_hands_that_were_estimated_are_no_labels_of_images(tmp_path, bag, model, capsys):
     hands = tmp_path / 'hands.npz'
     assert main(['estimate', *arguments(bag, model)[1:], '--out', str(hands)]) == 0

@@ -194,12 +194,15 @@ def test_lifting_a_hand_worked_case():
 
 
 def test_nyu_depth_is_written_in_green_and_blue(tmp_path):
-    picture = np.zeros((2, 2, 3), np.uint8)
+    picture = np.zeros((480, 640, 3), np.uint8)
     picture[0, 0] = 0x21, 0x03, 0  # B, G, R: 0x0321 = 801 mm
     picture[0, 1] = 0xD1, 0x07, 0  # 2001: no data
     cv2.imwrite(str(tmp_path / 'depth_1_0000002.png'), picture)
     depths = tompson.read_nyu_depths(tmp_path, [0, 1])
-    assert list(depths) == [1] and depths[1] == pytest.approx(np.array([[0.801, 0], [0, 0]]))
+    assert list(depths) == [1] and depths[1][:2, :2] == pytest.approx(np.array([[0.801, 0], [0, 0]]))
+    cv2.imwrite(str(tmp_path / 'depth_1_0000004.png'), picture[::2, ::2])
+    with pytest.raises(HandPoseError, match=r'depth_1_0000004\.png has 320x240 pixels, .* have 640x480'):
+        tompson.read_nyu_depths(tmp_path, [3])
     cv2.imwrite(str(tmp_path / 'depth_1_0000003.png'), np.ones((4, 4), np.uint16))
     with pytest.raises(HandPoseError, match=r'depth_1_0000003\.png is not a depth image'):
         tompson.read_nyu_depths(tmp_path, [2])

@@ -189,8 +189,9 @@ def _evaluate_live(args: argparse.Namespace, settings: Settings) -> Result:
     with DepthBag(args.bags[0], **settings.bag) as bag:
         for frame, _ in until_damaged(bag, notes):
             stamps.append(frame.stamp_ns)
-            with suppress(InputError):  # one image that cannot be decoded is none that was lost
-                intrinsics, frame_id = intrinsics or frame.intrinsics, frame.frame_id
+            if intrinsics is None:
+                with suppress(InputError):  # one image that cannot be decoded is none that was lost
+                    intrinsics, frame_id = frame.intrinsics, frame.frame_id
         if intrinsics is None:
             raise InputError(f'{args.bags[0]}: there is no depth image that can be decoded')
         answers = play_through_node(bag, args.camera_info_topic,
@@ -222,8 +223,9 @@ def _run_bags(args: argparse.Namespace) -> int:
         args.parser.error('--compare and --via-ros work with one bag, not with several')
     settings, names = _settings(args), _names(args.bags)
     sinks = {bag: partial(HandBag, Path(args.out_bag) / f'{names[bag]}.mcap') for bag in args.bags if args.out_bag}
-    for bag in sinks:
-        keep_input(Path(args.out_bag) / f'{names[bag]}.mcap', bag)
+    for name in names.values():
+        for bag in args.bags if args.out_bag else ():
+            keep_input(Path(args.out_bag) / f'{name}.mcap', bag)
     summaries: dict[str, Any] = {}
     try:
         for bag, outcome in evaluate_bags(args.bags, settings, args.jobs, _progress('bags'), sinks):

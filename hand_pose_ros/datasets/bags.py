@@ -16,7 +16,7 @@ from hand_pose_ros.datasets.base import (
     RecordedDataset,
     are_labelled,
     fingerprint,
-    states,
+    require,
     tell_left_out,
 )
 from hand_pose_ros.skeleton import Skeleton, get_skeleton
@@ -104,4 +104,4 @@ def _images(bag: Path) -> Iterator[Frame]:
 
 def _contents(bag: Path) -> bytes:
     """Changes with the depth and the cameras in a bag."""
-    return states(sorted(path for path in bag.rglob('*') if path.is_file()) if bag.is_dir() else [bag])
+    return require('bags', sorted(path for path in bag.rglob('*') if path.is_file()) if bag.is_dir() else [bag])

@@ -141,23 +141,25 @@ def joints_in_metres(joints: Tensor, cube_center: Tensor, cube_side: Tensor) -> 
     return torch.cat([points[..., :2] * (points[..., 2:] / center[..., 2:]), points[..., 2:]], dim=-1)
 
 
-def require(dataset: str, paths: Iterable[Path]) -> None:
-    """Make sure that files are there.
+def require(dataset: str, paths: Iterable[Path]) -> bytes:
+    """Make sure that files are there; what it returns changes with them, of which reading all bytes takes minutes.
 
     Raises:
         DatasetError: some are not; the sentence names the first.
     """
-    missing = [path for path in paths if not path.is_file()]
+    missing, states = [], []
+    for path in paths:
+        try:
+            state = path.stat()
+        except OSError:
+            missing.append(path)
+        else:
+            states.append(f'{path.name}{state.st_size}-{state.st_mtime_ns}')
     if missing:
         others = f' (and {len(missing) - 1} more files)' if len(missing) > 1 else ''
         raise DatasetError(f'{dataset}: {missing[0]} is missing{others}; is the download complete, and is --set root= '
                            'the folder described in docs/training.md?')
-
-
-def states(files: Iterable[Path]) -> bytes:
-    """Changes with the files, of which reading every byte would take minutes."""
-    return ''.join(f'{path.name}{state.st_size}-{state.st_mtime_ns}'
-                   for path, state in ((path, path.stat()) for path in files)).encode()
+    return ''.join(states).encode()
 
 
 def are_labelled(joints: NDArray[Any]) -> NDArray[np.bool_]:
@@ -180,11 +182,11 @@ def check_depth(dataset: str, path: Path, depth: NDArray[Any], intrinsics: Intri
                            f'{expected[0]}x{expected[1]}; copy or download it as it is distributed')
 
 
-def read_depth(path: Path, dataset: str, channels: int = 1) -> NDArray[Any]:
+def read_depth(path: Path, dataset: str, intrinsics: Intrinsics, channels: int = 1) -> NDArray[Any]:
     """A depth PNG as it is stored, (H, W) uint16 or, with 3 channels, (H, W, 3) uint8 blue, green, red.
 
     Raises:
-        DatasetError: the file is missing, damaged or of another kind.
+        DatasetError: the file is missing, damaged, of another kind, or of another size than the camera's images.
     """
     data = np.fromfile(path, np.uint8) if path.is_file() else None
     if data is None:
@@ -198,6 +200,7 @@ def read_depth(path: Path, dataset: str, channels: int = 1) -> NDArray[Any]:
     if (image.ndim, image.dtype) != ((2, np.uint16) if channels == 1 else (3, np.uint8)):
         raise DatasetError(f'{dataset}: {path} is not a depth image of this dataset: it has shape {image.shape} '
                            f'and type {image.dtype}')
+    check_depth(dataset, path, image, intrinsics)
     return image
 
 

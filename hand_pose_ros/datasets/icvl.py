@@ -11,11 +11,9 @@ from hand_pose_ros.datasets.base import (
     LabelledFrame,
     RecordedDataset,
     are_labelled,
-    check_depth,
     fingerprint,
     read_depth,
     require,
-    states,
     tell_left_out,
 )
 from hand_pose_ros.geometry import Intrinsics
@@ -65,15 +63,13 @@ class ICVL(RecordedDataset):
         self._depth = lists[0].parent / 'Depth'
         self._frames = [frame for frame, usable in zip(frames, whole, strict=True) if usable]
         self.size = len(self._frames)
-        images = [self._depth / path for path, _ in self._frames]
-        require('ICVL', images)
+        images = require('ICVL', (self._depth / path for path, _ in self._frames))
         labels = (f'{path}{uvd.tolist()}'.encode() for path, uvd in self._frames)
-        self.fingerprint = fingerprint(self.name, states(images), *labels)
+        self.fingerprint = fingerprint(self.name, images, *labels)
 
     def frame(self, index: int) -> LabelledFrame:
         path, uvd = self._frames[index]
-        depth = (read_depth(self._depth / path, 'ICVL') / 1000).astype(np.float32)
-        check_depth('ICVL', self._depth / path, depth, INTRINSICS)
+        depth = (read_depth(self._depth / path, 'ICVL', INTRINSICS) / 1000).astype(np.float32)
         joints = INTRINSICS.back_project(uvd[:, :2], uvd[:, 2] / 1000)
         return LabelledFrame(depth, INTRINSICS, joints, joints[PALM], self.cube_side)
 

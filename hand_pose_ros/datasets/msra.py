@@ -15,7 +15,6 @@ from hand_pose_ros.datasets.base import (
     check_depth,
     fingerprint,
     require,
-    states,
     tell_left_out,
 )
 from hand_pose_ros.geometry import Intrinsics
@@ -68,7 +67,8 @@ class MSRA(RecordedDataset):
         self._frames = [frame for frame, usable in zip(self._frames, whole, strict=True) if usable]
         self.size = len(self._frames)
         labels = (f'{path}{joints.tolist()}'.encode() for _, path, joints in self._frames)
-        self.fingerprint = fingerprint(self.name, states(path for _, path, _ in self._frames), *labels)
+        images = require('MSRA', (path for _, path, _ in self._frames))
+        self.fingerprint = fingerprint(self.name, images, *labels)
 
     def frame(self, index: int) -> LabelledFrame:
         subject, path, joints = self._frames[index]

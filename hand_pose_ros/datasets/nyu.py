@@ -13,11 +13,9 @@ from hand_pose_ros.datasets.base import (
     LabelledFrame,
     RecordedDataset,
     are_labelled,
-    check_depth,
     fingerprint,
     read_depth,
     require,
-    states,
     tell_left_out,
 )
 from hand_pose_ros.geometry import Intrinsics
@@ -42,9 +40,9 @@ def read_nyu_depth(path: Path) -> NDArray[np.float32]:
     above is no reading.
 
     Raises:
-        DatasetError: the file is missing, damaged or of another kind.
+        DatasetError: the file is missing, damaged, or of another kind or size.
     """
-    image = read_depth(path, 'NYU', channels=3).astype(np.uint16)
+    image = read_depth(path, 'NYU', INTRINSICS, channels=3).astype(np.uint16)
     millimetres = image[..., 1] << 8 | image[..., 0]
     return np.where(millimetres < 2001, millimetres, 0).astype(np.float32) / np.float32(1000)
 
@@ -81,9 +79,8 @@ class NYU(RecordedDataset):
             raise DatasetError(f'NYU: {labels} has no labelled frame of {split} among its {count}; is it complete?')
         tell_left_out(self.name, len(parts[split]) - len(self._frames), len(parts[split]))
         self.size = len(self._frames)
-        files = [self._path(frame) for frame in self._frames]
-        require('NYU', files)
-        self.fingerprint = fingerprint(self.name, self._joints.tobytes(), states(files))
+        images = require('NYU', (self._path(frame) for frame in self._frames))
+        self.fingerprint = fingerprint(self.name, self._joints.tobytes(), images)
 
     def _path(self, frame: int) -> Path:
         return self._folder / f'depth_1_{frame + 1:07d}.png'
@@ -91,7 +88,6 @@ class NYU(RecordedDataset):
     def frame(self, index: int) -> LabelledFrame:
         frame = self._frames[index]
         depth = read_nyu_depth(self._path(frame))
-        check_depth('NYU', self._path(frame), depth, INTRINSICS)
         joints = self._joints[frame]
         smaller = self._folder.name == 'test' and frame >= FIRST_SUBJECT
         # The factor is the original authors' knowledge of the subject's hand: say so with every number that uses it.

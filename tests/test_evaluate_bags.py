@@ -221,7 +221,7 @@ def test_hands_of_one_bag_do_not_become_a_part_of_another(tmp_path, bag, model, 
     (folder := tmp_path / 'recording').mkdir()
     shutil.copy(bag, folder / 'recording_0.mcap')
     assert main(['evaluate', str(folder), *arguments(bag, model, '--out-bag', folder)[1:]]) == 1
-    assert 'ball.mcap: this is the input, which would be lost' in capsys.readouterr().err
+    assert 'recording.mcap: this is the input, which would be lost' in capsys.readouterr().err
 
 
 def test_hands_that_were_estimated_are_no_labels_of_images(tmp_path, bag, model, capsys):

@@ -223,9 +223,8 @@ def _run_bags(args: argparse.Namespace) -> int:
         args.parser.error('--compare and --via-ros work with one bag, not with several')
     settings, names = _settings(args), _names(args.bags)
     sinks = {bag: partial(HandBag, Path(args.out_bag) / f'{names[bag]}.mcap') for bag in args.bags if args.out_bag}
-    for name in names.values():
-        for bag in args.bags if args.out_bag else ():
-            keep_input(Path(args.out_bag) / f'{name}.mcap', bag)
+    for bag in sinks:
+        keep_input(Path(args.out_bag) / f'{names[bag]}.mcap', bag)
     summaries: dict[str, Any] = {}
     try:
         for bag, outcome in evaluate_bags(args.bags, settings, args.jobs, _progress('bags'), sinks):

@@ -244,6 +244,28 @@ def test_many_hands_run_by_turns_in_graphs_that_none_overwrites_too_soon(count, 
     assert len(engine._captured) <= 3
 
 
+@pytest.mark.parametrize('name', ['deep_prior', 'hand_dense'])
+@pytest.mark.parametrize(('moved', 'engine'), [(0.001, 'cuda graph'), (0.1, 'pytorch'), (np.nan, 'pytorch')])
+def test_an_engine_that_is_wrong_on_a_gpu_is_not_used(name, moved, engine, monkeypatch, caplog):
+    """Whose kernels were compiled for that GPU, perhaps the first of its kind: here with a stand-in."""
+    class Stranger(TorchEngine):
+        name = 'cuda graph'
+
+        def run(self, patches: np.ndarray) -> np.ndarray:
+            return super().run(patches) + np.float32(moved)
+
+    monkeypatch.setattr('torch.cuda.is_available', lambda: True)
+    monkeypatch.setattr('hand_pose_ros.runtime.cuda_engine.CudaEngine', lambda pipeline, device: Stranger(pipeline))
+    monkeypatch.setattr('hand_pose_ros.runtime.TorchEngine', lambda pipeline, device='cpu': TorchEngine(pipeline))
+    network = load_checkpoint(name).network
+    chosen = make_engine(network, 'cuda')
+    assert chosen.name == engine
+    assert ('other joints' in caplog.text) == (engine == 'pytorch')
+    patches = hand_patches(1)
+    if engine == 'pytorch':
+        np.testing.assert_array_equal(chosen.run(patches), TorchEngine(Pipeline(network).eval()).run(patches))
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason='needs a CUDA GPU')
 @pytest.mark.parametrize('refiner', [None, 'or_ref'])
 @pytest.mark.parametrize('architecture', ARCHITECTURES)
@@ -251,6 +273,7 @@ def test_the_gpu_engine_equals_plain_pytorch(architecture, refiner):
     network = trained(architecture)
     second = trained_refiner(refiner) if refiner else None
     engine = make_engine(network, 'cuda', refiner=second)
+    assert engine.name == 'cuda graph'
     plain = TorchEngine(Pipeline(network, second))
     many = [LARGEST + 3] if architecture == 'deep_prior' else []
     for count in [1, 3, 2, 9, *many]:  # graphs of 1, 4, 2 and 16, and of the largest

@@ -124,6 +124,24 @@ def test_a_bag_into_a_bag(tmp_path, bag, command, expected):
     assert counts['/hand/joints'] == 6 and counts['/hand/skeleton'] == 1
 
 
+@pytest.mark.parametrize('verb', [('estimate', '--out'), ('evaluate', '--out-bag')])
+def test_hands_are_recorded_when_their_image_was(tmp_path, depths, weights, verb):
+    """So that they play beside it, whatever the stamps are: some drivers leave them 0."""
+    with BagWriter(tmp_path / 'stamped.mcap') as writer:
+        writer.write_depth(0, 'camera', depths[0], CAMERA)
+    with Bag(tmp_path / 'stamped.mcap') as source, BagWriter(tmp_path / 'bag.mcap') as writer:
+        for stamp in STAMPS:
+            for connection, _, data in source.messages(source.connections):
+                writer.write_serialized(connection.topic, connection.msgtype, data, stamp)
+    bag, out = str(tmp_path / 'bag.mcap'), str(tmp_path / 'out.mcap')
+    assert main([verb[0], bag, '--model', str(weights), verb[1], out]) == 0
+    assert [record.stamp_ns for record in read_hands(tmp_path / 'out.mcap')] == [0] * len(STAMPS)
+    with Bag(tmp_path / 'out.mcap') as result:
+        times = {(c.topic, time_ns) for c, time_ns, _ in result.messages(result.connections)}
+    assert times == {('/hand/skeleton', STAMPS[0]), *((f'/hand/{name}', stamp) for name in ('joints', 'markers')
+                                                      for stamp in STAMPS)}
+
+
 def test_markers_are_in_the_bag_without_ros(tmp_path, depths, weights, monkeypatch):
     for name in ('rclpy', 'visualization_msgs', 'hand_pose_ros.msg', 'hand_pose_ros.ros'):
         monkeypatch.setitem(sys.modules, name, None)  # importing it fails

@@ -29,11 +29,13 @@ class Frame:
         stamp_ns: of the header.
         frame_id: of the header.
         topic: where it was recorded.
+        recorded_ns: when it was recorded.
     """
 
     stamp_ns: int
     frame_id: str
     topic: str
+    recorded_ns: int
     _message: Any
     _camera: Intrinsics | Sequence[float]
     _depth_scale: float
@@ -107,7 +109,7 @@ class DepthBag(Bag):
                 for _, _, data in self.messages([connection]):
                     if self._remember(connection, self.deserialize(connection, data), cameras):
                         break
-            for connection, _, data in self.messages([*self._images, *self._infos]):
+            for connection, recorded_ns, data in self.messages([*self._images, *self._infos]):
                 message = self.deserialize(connection, data)
                 if connection.msgtype == CAMERA_INFO:
                     self._remember(connection, message, cameras)
@@ -116,7 +118,8 @@ class DepthBag(Bag):
                 if not cameras and not self._intrinsics:
                     raise InputError(self._unusable)
                 camera = self._intrinsics if not cameras else cameras.get(header.frame_id, cameras[''])
-                yield Frame(stamp_ns(header), header.frame_id, self.depth_topic, message, camera, self._depth_scale)
+                yield Frame(stamp_ns(header), header.frame_id, self.depth_topic, recorded_ns, message, camera,
+                            self._depth_scale)
                 count += 1
         except InputError as error:
             raise InputError(f'{error} ({count} of {len(self)} depth images were read)') from error

@@ -109,24 +109,27 @@ class BagWriter:
                 header=header, format=name, data=np.frombuffer(data, np.uint8)), stamp_ns)
 
     def write_hands(self, stamp_ns: int, frame_id: str, hands: Sequence[HandEstimate], skeleton: Skeleton = HAND21,
-                    topic: str = '/hand/joints') -> None:
-        """Write a HandJointsArray: all hands of one image, none included."""
+                    topic: str = '/hand/joints', *, recorded_ns: int | None = None) -> None:
+        """Write a HandJointsArray: all hands of one image, none included; `recorded_ns` is its time, if not the stamp.
+        """
         self.write(topic, HANDS, self._types[HANDS](
             header=self._header(stamp_ns, frame_id), skeleton=skeleton.name,
-            hands=[self._hand(hand) for hand in hands]), stamp_ns)
+            hands=[self._hand(hand) for hand in hands]), stamp_ns if recorded_ns is None else recorded_ns)
 
-    def write_skeleton(self, stamp_ns: int, frame_id: str, skeleton: Skeleton, model: str, model_version: str) -> None:
+    def write_skeleton(self, stamp_ns: int, frame_id: str, skeleton: Skeleton, model: str, model_version: str, *,
+                       recorded_ns: int | None = None) -> None:
         """Write what the joints mean (HandSkeleton) on /hand/skeleton, latched; once."""
         self.write('/hand/skeleton', SKELETON, self._types[SKELETON](
             header=self._header(stamp_ns, frame_id), name=skeleton.name, joint_names=list(skeleton.joint_names),
             parents=np.array(skeleton.parents, np.int8), model=model, model_version=model_version),
-            stamp_ns, latched=True)
+            stamp_ns if recorded_ns is None else recorded_ns, latched=True)
 
-    def write_markers(self, stamp_ns: int, frame_id: str, markers: Sequence[Marker]) -> None:
+    def write_markers(self, stamp_ns: int, frame_id: str, markers: Sequence[Marker], *,
+                      recorded_ns: int | None = None) -> None:
         """Write a MarkerArray on /hand/markers (see `hand_pose_ros.markers`); players show it until it is deleted."""
         header = self._header(stamp_ns, frame_id)
         message = self._types[MARKERS](markers=[self._marker(header, marker) for marker in markers])
-        self.write('/hand/markers', MARKERS, message, stamp_ns)
+        self.write('/hand/markers', MARKERS, message, stamp_ns if recorded_ns is None else recorded_ns)
 
     def close(self) -> None:
         """Complete the bag and move it into place."""

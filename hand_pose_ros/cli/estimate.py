@@ -100,6 +100,7 @@ class DepthInput:
     name: str
     stamp_ns: int
     frame_id: str
+    recorded_ns: int
     load: Callable[[], tuple[NDArray[np.float32], Intrinsics]]
 
 
@@ -172,7 +173,8 @@ def _from_pngs(paths: Sequence[Path], intrinsics: Sequence[float], depth_scale: 
         return depth, Intrinsics(fx, fy, cx, cy, width=depth.shape[1], height=depth.shape[0])
 
     for i, path in enumerate(paths):
-        yield DepthInput(path.stem, i * _PNG_PERIOD_NS, 'camera', lambda path=path: load(path))  # type: ignore[misc]
+        time_ns = i * _PNG_PERIOD_NS
+        yield DepthInput(path.stem, time_ns, 'camera', time_ns, lambda path=path: load(path))  # type: ignore[misc]
 
 
 def from_bag(bag: DepthBag) -> Iterator[DepthInput]:
@@ -180,12 +182,12 @@ def from_bag(bag: DepthBag) -> Iterator[DepthInput]:
     i = 0
     try:
         for i, frame in enumerate(bag, start=1):
-            yield DepthInput(f'{i - 1:06d}', frame.stamp_ns, frame.frame_id,
+            yield DepthInput(f'{i - 1:06d}', frame.stamp_ns, frame.frame_id, frame.recorded_ns,
                              lambda frame=frame: (frame.depth, frame.intrinsics))  # type: ignore[misc]
     except InputError as error:
         def fail(error: InputError = error) -> tuple[NDArray[np.float32], Intrinsics]:
             raise error
-        yield DepthInput(f'{i:06d}', 0, '', fail)
+        yield DepthInput(f'{i:06d}', 0, '', 0, fail)
 
 
 def _natural(path: Path) -> list[Any]:

@@ -18,12 +18,14 @@ TOPICS = ('/hand/joints', '/hand/markers', '/hand/skeleton')
 
 
 class Stamped(Protocol):
-    """An image, or whatever else has its stamp and its frame."""
+    """An image, or whatever else has its stamp, its frame and the time of its recording."""
 
     @property
     def stamp_ns(self) -> int: ...
     @property
     def frame_id(self) -> str: ...
+    @property
+    def recorded_ns(self) -> int: ...
 
 
 class HandBag:
@@ -51,13 +53,14 @@ class HandBag:
         self._writer.__exit__(*error)
 
     def add(self, image: Stamped, hands: Sequence[HandEstimate]) -> None:
-        """Write the hands of an image, none included."""
+        """Write the hands of an image, none included, at the time of its recording."""
+        header, time = (image.stamp_ns, image.frame_id), image.recorded_ns
         if not self._begun:
             from hand_pose_ros.models.checkpoints import described  # imports torch: not for --help
-            self._writer.write_skeleton(image.stamp_ns, image.frame_id, self._skeleton, *described(self._metadata))
+            self._writer.write_skeleton(*header, self._skeleton, *described(self._metadata), recorded_ns=time)
             self._begun = True
-        self._writer.write_hands(image.stamp_ns, image.frame_id, hands, self._skeleton)
-        self._writer.write_markers(image.stamp_ns, image.frame_id, self._markers.update(hands))
+        self._writer.write_hands(*header, hands, self._skeleton, recorded_ns=time)
+        self._writer.write_markers(*header, self._markers.update(hands), recorded_ns=time)
 
 
 def _keep_recording(path: Path) -> None:

@@ -245,35 +245,45 @@ def test_many_hands_run_by_turns_in_graphs_that_none_overwrites_too_soon(count, 
 
 
 @pytest.mark.parametrize('name', ['deep_prior', 'hand_dense'])
-@pytest.mark.parametrize(('moved', 'engine'), [(0.001, 'cuda graph'), (0.1, 'pytorch'), (np.nan, 'pytorch')])
-def test_an_engine_that_is_wrong_on_a_gpu_is_not_used(name, moved, engine, monkeypatch, caplog):
-    """Whose kernels were compiled for that GPU, perhaps the first of its kind: here with a stand-in."""
+@pytest.mark.parametrize(('moved', 'used', 'said'), [
+    ({'own': 0.001}, 'own', ''),
+    ({'own': np.nan, 'none': 0.001}, 'none', 'as kernels of our own cannot be used on cuda: the joints'),
+    ({'own': 0.1, 'none': 0.1}, 'pytorch', 'as CUDA graphs cannot be used on cuda: the joints are not those'),
+    ({}, 'pytorch', 'as CUDA graphs cannot be used on cuda: no kernel image')])
+def test_what_is_wrong_or_fails_on_a_gpu_is_done_without(name, moved, used, said, monkeypatch, caplog):
+    """As its kernels are compiled where no test has been; here with a stand-in."""
     class Stranger(TorchEngine):
-        name = 'cuda graph'
+        def __init__(self, pipeline: Pipeline, device: str, kernels: object) -> None:
+            self.name = 'own' if kernels else 'none'
+            if self.name not in moved:
+                raise ValueError('no kernel image\nand ten lines more')
+            super().__init__(pipeline)
 
         def run(self, patches: np.ndarray) -> np.ndarray:
-            return super().run(patches) + np.float32(moved)
+            return super().run(patches) + np.float32(moved[self.name])
 
     monkeypatch.setattr('torch.cuda.is_available', lambda: True)
-    monkeypatch.setattr('hand_pose_ros.runtime.cuda_engine.CudaEngine', lambda pipeline, device: Stranger(pipeline))
-    monkeypatch.setattr('hand_pose_ros.runtime.TorchEngine', lambda pipeline, device='cpu': TorchEngine(pipeline))
+    monkeypatch.setattr('hand_pose_ros.runtime.check_device', lambda device: None)
+    monkeypatch.setattr('hand_pose_ros.runtime.cuda_engine._own_kernels', lambda: copy)  # any module
+    monkeypatch.setattr('hand_pose_ros.runtime.cuda_engine.CudaEngine', Stranger)
+    monkeypatch.setattr('hand_pose_ros.runtime.cuda_engine.TorchEngine', lambda pipeline, _='': TorchEngine(pipeline))
     network = load_checkpoint(name).network
-    chosen = make_engine(network, 'cuda')
-    assert chosen.name == engine
-    assert ('other joints' in caplog.text) == (engine == 'pytorch')
-    patches = hand_patches(1)
-    if engine == 'pytorch':
-        np.testing.assert_array_equal(chosen.run(patches), TorchEngine(Pipeline(network).eval()).run(patches))
+    engine = make_engine(network, 'cuda')
+    assert engine.name == used
+    assert said in caplog.text and bool(said) == ('a hand takes longer' in caplog.text)
+    if used == 'pytorch':
+        patches = hand_patches(1)
+        np.testing.assert_array_equal(engine.run(patches), TorchEngine(Pipeline(network).eval()).run(patches))
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason='needs a CUDA GPU')
 @pytest.mark.parametrize('refiner', [None, 'or_ref'])
 @pytest.mark.parametrize('architecture', ARCHITECTURES)
-def test_the_gpu_engine_equals_plain_pytorch(architecture, refiner):
+def test_the_gpu_engine_equals_plain_pytorch(architecture, refiner, caplog):
     network = trained(architecture)
     second = trained_refiner(refiner) if refiner else None
     engine = make_engine(network, 'cuda', refiner=second)
-    assert engine.name == 'cuda graph'
+    assert engine.name == 'cuda graph' and 'takes longer' not in caplog.text
     plain = TorchEngine(Pipeline(network, second))
     many = [LARGEST + 3] if architecture == 'deep_prior' else []
     for count in [1, 3, 2, 9, *many]:  # graphs of 1, 4, 2 and 16, and of the largest

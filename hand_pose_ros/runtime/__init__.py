@@ -8,14 +8,12 @@ import os
 from collections.abc import Callable
 from typing import TypeVar
 
-import numpy as np
 import torch
 from torch import nn
 
 from hand_pose_ros.errors import HandPoseError
-from hand_pose_ros.geometry import PATCH_SIZE
 from hand_pose_ros.models import REFINERS
-from hand_pose_ros.runtime.engine import Array, Engine, Pipeline, TorchEngine
+from hand_pose_ros.runtime.engine import Engine, Pipeline, TorchEngine
 from hand_pose_ros.runtime.lanes import fill_lanes
 from hand_pose_ros.runtime.onnx_engine import OnnxEngine
 
@@ -23,8 +21,6 @@ __all__ = ['Engine', 'check_device', 'cores', 'default_threads', 'make_engine']
 
 NO_JOINTS = ('hand_finder', 'center_refiner', *REFINERS)
 """Networks that are parts of something, or find hands."""
-ROUNDING = 0.02
-"""Cube units: rounding to half precision moves half of the joints by a third of this at most (docs/performance.md)."""
 
 _log = logging.getLogger(__name__)
 _T = TypeVar('_T')
@@ -48,8 +44,7 @@ def make_engine(network: nn.Module, device: str = 'auto', num_threads: int | Non
 
     Args:
         device: 'cpu', 'cuda', 'cuda:N', any other device of PyTorch, or 'auto': a CUDA GPU if there is one, else the
-            CPU. ONNX Runtime runs the network on a CPU, CUDA graphs (in half precision) on a GPU, unless they give
-            other joints there than the CPU does; PyTorch elsewhere.
+            CPU. ONNX Runtime runs the network on a CPU, CUDA graphs (in half precision) on a GPU, PyTorch elsewhere.
         num_threads: on the CPU, at most: see `OnnxEngine`; None takes `default_threads()`.
 
     Raises:
@@ -72,25 +67,13 @@ def make_engine(network: nn.Module, device: str = 'auto', num_threads: int | Non
         engine = OnnxEngine(pipeline, threads)
         why += f'; {engine.threads} of {threads} threads for one hand'
     elif device.startswith('cuda'):
-        from hand_pose_ros.runtime.cuda_engine import CudaEngine
-        plain = TorchEngine(copy.deepcopy(pipeline))
-        engine = _on(device, lambda: CudaEngine(pipeline, device))
-        if not agree(engine, plain):
-            _log.warning('%s gives other joints on %s than the CPU does: the network runs slower, in plain PyTorch',
-                         engine.name, device)
-            engine = TorchEngine(plain.pipeline, device)
+        from hand_pose_ros.runtime.cuda_engine import fastest
+        check_device(device)
+        engine = _on(device, lambda: fastest(pipeline, device))
     else:
         engine = _on(device, lambda: TorchEngine(pipeline, device))
     _log.info('runs on %s (%s)', engine.name, why)
     return engine
-
-
-def agree(engine: Engine, plain: Engine) -> bool:
-    """Whether the joints of a palm are the same from both, but for rounding."""
-    x, y = np.meshgrid(*[np.linspace(-1, 1, PATCH_SIZE, dtype=np.float32)] * 2)
-    palm: Array = np.where(x ** 2 + y ** 2 < 0.4, 0.3 * x - 0.2 * y, np.float32(1))[None, None]
-    moved = np.linalg.norm(engine.run(palm) - plain.run(palm), axis=-1)
-    return bool(np.median(moved) < ROUNDING)  # not of NaN
 
 
 def check_device(device: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 from collections import deque
 from dataclasses import dataclass, field
@@ -12,13 +13,15 @@ import torch
 from torch import Tensor
 
 from hand_pose_ros.geometry import PATCH_SIZE
-from hand_pose_ros.runtime.engine import Array, Engine, Pipeline
+from hand_pose_ros.runtime.engine import Array, Engine, Pipeline, TorchEngine
 from hand_pose_ros.runtime.fused import fuse
 
 WARM_UP = 3
 """Runs before the capture: libraries choose algorithms and allocate in the first ones, which a graph must not hold."""
 LARGEST = 1024
 """Hands of one graph. Of more, the next are brought to pinned memory while the GPU is at these."""
+ROUNDING = 0.02
+"""Cube units: rounding to half precision moves half of the joints by a third of this at most (docs/performance.md)."""
 
 _log = logging.getLogger(__name__)
 
@@ -43,13 +46,16 @@ class CudaEngine(Engine):
 
     Other sizes run in the next larger graph, or, beyond the largest, in two of its size by turns. Input and output lie
     in pinned host memory, and the copies are part of the graph, so that a call is one launch and one wait.
+
+    Args:
+        kernels: `runtime.kernels`, or None to do without.
     """
 
     name = 'cuda graph'
 
-    def __init__(self, pipeline: Pipeline, device: str = 'cuda') -> None:
+    def __init__(self, pipeline: Pipeline, device: str, kernels: ModuleType | None) -> None:
         self.outputs, self.device = pipeline.outputs, torch.device(device)
-        fuse(pipeline, _own_kernels(self.device))
+        fuse(pipeline, kernels)
         pipeline.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.pipeline = pipeline.to(self.device).reduce_precision()
         self.stream = torch.cuda.Stream(self.device)
@@ -100,15 +106,39 @@ class CudaEngine(Engine):
         return self.pipeline(source.to(self.device, non_blocking=True))
 
 
-def _own_kernels(device: torch.device) -> ModuleType | None:
-    """`runtime.kernels`, where Triton (which PyTorch for CUDA brings along on Linux) can compile them."""
+def fastest(pipeline: Pipeline, device: str) -> Engine:
+    """The fastest engine that gives the joints of the CPU.
+
+    Kernels are compiled and chosen for the GPU that is there, perhaps the first of its kind: what fails is
+    done without.
+    """
+    plain = TorchEngine(copy.deepcopy(pipeline))
+    for kernels in dict.fromkeys((_own_kernels(), None)):
+        try:
+            engine = CudaEngine(copy.deepcopy(pipeline), device, kernels)
+            problem = '' if _agree(engine, plain) else 'the joints are not those of the CPU'
+        except Exception as error:  # PyTorch, CUDA and Triton have errors of their own
+            problem = (str(error) or type(error).__name__).splitlines()[0]
+        if not problem:
+            return engine
+        _log.warning('a hand takes longer than it could, as %s cannot be used on %s: %s',
+                     'kernels of our own' if kernels else 'CUDA graphs', device, problem)
+    return TorchEngine(plain.pipeline, device)
+
+
+def _own_kernels() -> ModuleType | None:
+    """`runtime.kernels`, where there is Triton, which PyTorch for CUDA brings along on Linux."""
     try:
         from hand_pose_ros.runtime import kernels
-        with torch.cuda.device(device):
-            one = torch.ones(1, 1, device=device)
-            kernels.linear(one, one, one[0], relu=False).cpu()
-    except Exception as error:  # no Triton, no C compiler, a GPU too old: each has an error of its own
-        _log.warning('a hand takes longer than it could, as kernels cannot be compiled here: %s',
-                     (str(error) or type(error).__name__).splitlines()[0])
+    except ImportError as error:
+        _log.warning('a hand takes longer than it could, as kernels cannot be compiled here: %s', error)
         return None
     return kernels
+
+
+def _agree(engine: Engine, plain: Engine) -> bool:
+    """Whether the joints of a palm are the same from both, but for rounding."""
+    x, y = np.meshgrid(*[np.linspace(-1, 1, PATCH_SIZE, dtype=np.float32)] * 2)
+    palm = np.where(x ** 2 + y ** 2 < 0.4, 0.3 * x - 0.2 * y, np.float32(1))[None, None]
+    moved = np.linalg.norm(engine.run(palm) - plain.run(palm), axis=-1)
+    return bool(np.median(moved) < ROUNDING)  # not of NaN

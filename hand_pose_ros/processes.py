@@ -5,16 +5,25 @@ from __future__ import annotations
 import multiprocessing
 import multiprocessing.connection
 import os
+import signal
 import threading
+import time
 
 
-def leave_with_parent() -> None:
-    """End this process as soon as the one that started it has ended, however that happened."""
+def leave_with_parent(grace_s: float = 0.0) -> None:
+    """End this process as soon as the one that started it has ended, however that happened.
+
+    Args:
+        grace_s: seconds to tidy up in, after a SIGTERM.
+    """
     parent = multiprocessing.parent_process()
     assert parent is not None
 
     def wait() -> None:
         multiprocessing.connection.wait([parent.sentinel])
+        if grace_s:
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(grace_s)
         os._exit(1)
 
     threading.Thread(target=wait, daemon=True).start()

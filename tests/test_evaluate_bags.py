@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -368,13 +369,17 @@ def test_images_of_one_stamp_are_not_played_through_the_node(tmp_path, model, ca
 
 
 @pytest.mark.skipif(not Path('/proc/self/task').exists(), reason='looks for processes in /proc')
-def test_processes_that_evaluate_end_with_the_one_that_started_them(tmp_path):
-    bag, image = tmp_path / 'long.mcap', depth_image(0)
-    with BagWriter(bag) as writer:
+@pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGTERM])
+def test_processes_that_evaluate_end_with_the_one_that_started_them_and_leave_nothing(number, tmp_path):
+    bag = tmp_path / 'long.mcap'
+    with Bag(record(tmp_path / 'one.mcap', frames=1)) as one, BagWriter(bag) as writer:
+        messages = list(one.messages(one.connections))
         for k in range(1500):
-            writer.write_depth(10**9 + k * STEP_NS, 'camera', image, CAMERA)
+            for connection, time_ns, data in messages:
+                writer.write_serialized(connection.topic, connection.msgtype, data, time_ns + k * STEP_NS)
     whole = subprocess.Popen([sys.executable, '-c', 'from hand_pose_ros.cli import main; main()',
-                              'evaluate', str(bag), str(bag), '--device', 'cpu', '--jobs', '2'])
+                              'evaluate', str(bag), str(bag), '--device', 'cpu', '--jobs', '2',
+                              '--out-bag', str(tmp_path / 'hands')])
 
     def children():
         return Path(f'/proc/{whole.pid}/task/{whole.pid}/children').read_text().split()
@@ -385,13 +390,13 @@ def test_processes_that_evaluate_end_with_the_one_that_started_them(tmp_path):
             time.sleep(0.05)
         return until()
 
-    assert wait(lambda: len(children()) >= 3), 'two workers and what watches over their resources'
+    assert wait(lambda: len([*tmp_path.glob('hands/.*/*')]) == 2), 'both are at work'
     started = children()
-    time.sleep(4)  # they are to be at work
-    assert whole.poll() is None
-    whole.kill()
-    whole.wait()
+    assert len(started) >= 3, 'two workers and what watches over their resources'
+    whole.send_signal(number)
+    whole.wait(60)
     assert wait(lambda: not any(Path(f'/proc/{one}').exists() for one in started))
+    assert [*tmp_path.glob('hands/*'), *tmp_path.glob('hands/.*')] == []
 
 
 def test_the_default_weights_have_one_name_with_and_without_the_node(tmp_path, bag, monkeypatch):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
+import signal
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
@@ -11,7 +13,6 @@ from contextlib import AbstractContextManager, ExitStack, closing, suppress
 from dataclasses import dataclass, field, replace
 from datetime import timedelta
 from itertools import islice, starmap
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -35,6 +36,8 @@ _R = TypeVar('_R')
 Outcome = Result | HandPoseError
 AHEAD = 2
 """So many images are decoded before their turn."""
+GRACE_S = 10.0
+"""For a process to remove what it has begun, when the one that started it was killed."""
 
 
 class Sink(Protocol):
@@ -238,7 +241,7 @@ def _attempts(paths: Sequence[str | Path], settings: Settings, sinks: Mapping[st
         for path in paths:
             yield path, _attempt(path, settings, sinks.get(path))
         return
-    pool = ProcessPoolExecutor(workers, get_context('spawn'), leave_with_parent)
+    pool = ProcessPoolExecutor(workers, multiprocessing.get_context('spawn'), _start_worker)
     try:
         futures = {pool.submit(_attempt, path, settings, sinks.get(path)): path for path in paths}
         for future in as_completed(futures):
@@ -247,8 +250,17 @@ def _attempts(paths: Sequence[str | Path], settings: Settings, sinks: Mapping[st
                 yield path, future.result()
             except Exception as error:  # the process itself died: out of memory, say
                 yield path, _unexpected(path, error)
+    except BaseException:  # SIGTERM, which need not reach the others as Ctrl-C does
+        for worker in multiprocessing.active_children():
+            worker.terminate()
+        raise
     finally:
         pool.shutdown(cancel_futures=True)  # after Ctrl-C no further bag begins
+
+
+def _start_worker() -> None:
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # it leaves no half-written bag behind
+    leave_with_parent(GRACE_S)
 
 
 def _attempt(path: str | Path, settings: Settings, open_sink: OpenSink | None) -> Outcome:

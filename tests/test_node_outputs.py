@@ -13,12 +13,13 @@ pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
 
 import rclpy
 from geometry_msgs.msg import Point, PoseArray, TransformStamped
-from sensor_msgs.msg import Image, JointState, RegionOfInterest
+from sensor_msgs.msg import CameraInfo, Image, JointState, RegionOfInterest
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool
 from test_node import (  # noqa: F401 (fixtures)
     FOCAL,
     HEIGHT,
+    LATCHED,
     RELIABLE,
     WIDTH,
     Rig,
@@ -280,6 +281,25 @@ def test_two_hands_keep_their_ids_whichever_is_nearer(rig: Rig) -> None:
     assert [hand.id for hand in one] == names[0][:1]
     back = rig.answer(publish, image(two_hands(0.64, 0.59), 1233)).hands
     assert len(back) == 2 and back[0].id == names[0][0] and back[1].id not in names[0]
+
+
+def test_what_is_live_is_shown_with_a_camera_info_that_was_published_once_before(rig: Rig) -> None:
+    rig.client.create_publisher(CameraInfo, 'depth/camera_info', LATCHED).publish(camera_info())
+    publish = rig.client.create_publisher(Image, 'depth/image_rect', RELIABLE).publish
+    cameras: list[Intrinsics] = []
+    rclpy.init()
+    try:
+        watcher = _Watcher(lambda _, __, camera: cameras.append(camera), lambda *_: None, 'raw', 0.001)
+
+        def shown() -> bool:  # the first images may come before it
+            publish(image(depth_with_hand()))
+            rclpy.spin_once(watcher._node, timeout_sec=0.05)
+            return bool(cameras)
+        rig.until(shown, 'a depth image')
+        watcher._node.destroy_node()
+    finally:
+        rclpy.try_shutdown()
+    assert cameras[0].fx == FOCAL
 
 
 def test_hands_that_do_not_fit_are_not_shown_live():

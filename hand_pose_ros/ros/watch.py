@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 import rclpy
 from numpy.typing import NDArray
+from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from hand_pose_ros import ros
@@ -61,6 +63,9 @@ class _Watcher:
         image_type, self._decode = (Image, decode_image) if transport == 'raw' else (CompressedImage, decode_compressed)
         topics.subscribe(self._node, CameraInfo, info_topic, self._camera.update, self._complain)
         topics.subscribe(self._node, image_type, self._topic, self._image, self._complain)
+        self._latched: Subscription | None = None  # to a camera_info that was published before the viewer came
+        # Steady: with simulated time that stands still it must be heard, too.
+        self._node.create_timer(1.0, self._listen_to_latched, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._node.create_subscription(HandJointsArray, 'hand/joints', self._hands, qos.RESULTS)
         self._hands_topic = self._node.resolve_topic_name('hand/joints')
         self._node.get_logger().info(f'showing {self._topic} and {self._hands_topic}')
@@ -72,6 +77,10 @@ class _Watcher:
             executor.spin()
         finally:
             self._node.destroy_node()
+
+    def _listen_to_latched(self) -> None:
+        if self._latched is None:
+            self._latched = topics.subscribe_latched(self._node, CameraInfo, self._camera.topic, self._camera.update)
 
     def _image(self, image: Any) -> None:
         self._frame = image.header.frame_id

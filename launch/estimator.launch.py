@@ -32,13 +32,16 @@ def _nodes(context: LaunchContext) -> list[Node]:
     """A parameter that is passed on beats params_file, so use_sim_time is passed on only if it was given."""
     use_sim_time = LaunchConfiguration('use_sim_time')
     given = [{'use_sim_time': use_sim_time}] if use_sim_time.perform(context) else []
+    depth_topic = LaunchConfiguration('depth_topic')
+    camera_info = str(Path(depth_topic.perform(context)).with_name('camera_info'))  # which RViz does not take along
     return [
         Node(package='hand_pose_ros', executable='estimator', name='estimator', output='screen',
              namespace=LaunchConfiguration('namespace'),
              parameters=[LaunchConfiguration('params_file'), *given],
-             remappings=[('depth/image_rect', LaunchConfiguration('depth_topic'))]),
+             remappings=[('depth/image_rect', depth_topic)]),
         Node(package='rviz2', executable='rviz2', arguments=['-d', str(SHARE / 'rviz' / 'hand_pose.rviz')],
              namespace=LaunchConfiguration('namespace'),
-             remappings=[('/hand/markers', 'hand/markers'), ('/depth/image_rect', LaunchConfiguration('depth_topic'))],
+             remappings=[('/hand/markers', 'hand/markers'), ('/depth/image_rect', depth_topic),
+                         ('/depth/camera_info', camera_info)],
              parameters=given, condition=IfCondition(LaunchConfiguration('rviz'))),
     ]

@@ -220,7 +220,7 @@ def test_the_launch_file_starts_the_node_with_its_parameter_file(use_sim_time: s
     spec.loader.exec_module(module)
     module.generate_launch_description()
     [function] = (kwargs['function'] for name, _, kwargs in calls if name == 'OpaqueFunction')
-    function({'use_sim_time': use_sim_time})
+    function({'use_sim_time': use_sim_time, 'depth_topic': '/camera/depth/image_raw'})
 
     declared = {args[0]: kwargs for name, args, kwargs in calls if name == 'DeclareLaunchArgument'}
     assert used == set(declared) and all(kwargs['description'] for kwargs in declared.values())
@@ -232,6 +232,7 @@ def test_the_launch_file_starts_the_node_with_its_parameter_file(use_sim_time: s
     assert (node['namespace'], node['remappings']) == ('namespace', [('depth/image_rect', 'depth_topic')])
     assert resource('config/estimator.yaml').samefile(declared['params_file']['default_value'])
     assert resource('rviz/hand_pose.rviz').samefile(rviz['arguments'][1])
+    assert ('/depth/camera_info', '/camera/depth/camera_info') in rviz['remappings']  # no depth is drawn without it
 
 
 def test_messages_hold_plain_arrays() -> None:

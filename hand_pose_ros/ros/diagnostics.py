@@ -129,11 +129,13 @@ def _judge(window: _Window, state: str, arrived: Counter[str], silence: str) -> 
         return DiagnosticStatus.WARN, window.problem
     if state != 'active':
         return DiagnosticStatus.OK, f'the node is {state}'
+    if silence:  # which knows more than that images are missing
+        return DiagnosticStatus.STALE, silence
     if arrived['received'] < (1 - MAX_DROPPED) * arrived['camera_infos']:
         return DiagnosticStatus.WARN, (f'{arrived["camera_infos"]} camera_info but only {arrived["received"]} images '
                                        f'arrived: if there should be as many, {remedy_for_lost_images()}')
     if counts['received'] == 0:
-        return DiagnosticStatus.STALE, silence or 'no images'
+        return DiagnosticStatus.STALE, 'no images'
     # Where none was answered, they wait for something, like their camera_info, and that is said in its time.
     too_many = counts['dropped'] > MAX_DROPPED * counts['received']
     if counts['received'] >= MIN_SAMPLE and counts['answered'] and too_many:

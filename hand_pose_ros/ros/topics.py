@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rclpy.node import Node
+from rclpy.qos import QoSPolicyKind, QoSReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
@@ -108,7 +109,12 @@ def explain_silence(node: Node, topic: str, message_type: type, seconds: float) 
         return f'{said}{where}: start the camera, or name its topic with --ros-args -r {IMAGE}:=/its/topic'
     if all(info.topic_type != topic_type for info in infos):
         return f'{said}, but {topic_type} is expected: remap {IMAGE}, or set the parameter transport'
-    return f'{said}: if it does publish, and nothing was said of its quality of service, {remedy_for_lost_images()}'
+    wanted = QoSReliabilityPolicy.RELIABLE
+    if all(info.qos_profile.reliability != wanted for info in infos) and any(
+            listener.topic_name == topic and listener.qos_profile.reliability == wanted
+            for listener in node.subscriptions):
+        return explain_incompatible(node, topic, qos.policy_name(QoSPolicyKind.RELIABILITY))
+    return f'{said}: if it does publish, {remedy_for_lost_images()}'
 
 
 def remedy_for_lost_images() -> str:

@@ -645,6 +645,16 @@ def test_incompatible_quality_of_service_is_named_with_its_remedy(rig: Rig, monk
                    '-p qos_overrides./depth/image_rect.subscription.reliability:=best_effort')
 
 
+def test_a_quality_of_service_that_has_no_effect_is_named(rig: Rig) -> None:
+    name = 'qos_overrides./camera/depth/image_raw.subscription'
+    without = f'{name}.durability', 'qos_overrides.depth/image_rect.subscription.depth'
+    rig.start('depth/image_rect:=/camera/depth/image_raw', **{f'{name}.reliability': 'reliable', without[0]: 'volatile',
+                                                              without[1]: 5})
+    for each in without:
+        rig.until_said(f"there is no parameter '{each}', so it has no effect", 'of /camera/depth/camera_info')
+    assert sum('has no effect' in text for text in rig.said()) == 2
+
+
 def test_a_wrong_quality_of_service_is_named(rig: Rig) -> None:
     name = 'qos_overrides./depth/image_rect.subscription'
     rig.start(**{f'{name}.reliability': 'perhaps'})

@@ -42,6 +42,8 @@ from hand_pose_ros.ros.outputs import Outputs
 from hand_pose_ros.ros.worker import NewestWorker
 
 _Transition = Callable[['EstimatorNode', LifecycleState], TransitionCallbackReturn]
+QOS = 'qos_overrides.'
+"""Parameters whose names begin so are declared when their topic is listened to."""
 SILENCE_S = 5.0
 """Images that stay away for so long are worth a warning."""
 BACK_NS = 100_000_000
@@ -82,8 +84,9 @@ class EstimatorNode(LifecycleNode):
         super().__init__('estimator', **kwargs)
         self._params = parameters.declare(self)
         for name in parameters.unknown(self):
-            self.get_logger().warning(f"there is no parameter '{name}', so it has no effect: "
-                                      'hand-pose estimator --parameters lists those that there are')
+            if not name.startswith(QOS):
+                self.get_logger().warning(f"there is no parameter '{name}', so it has no effect: "
+                                          'hand-pose estimator --parameters lists those that there are')
         self.add_on_set_parameters_callback(self._on_parameters)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', qos.RESULTS)
         self.create_service(SetBool, '~/enable', self._on_enable)
@@ -167,6 +170,10 @@ class EstimatorNode(LifecycleNode):
             inputs.append((RegionOfInterest, self.resolve_topic_name(topics.REGION), self._on_region))
         for kind, topic, callback in inputs:
             self._inputs.append(topics.subscribe(self, kind, topic, callback, self._complain))
+        for name in parameters.unknown(self):
+            if name.startswith(QOS):
+                self._say(f"there is no parameter '{name}', so it has no effect: history, depth and reliability of "
+                          f'{", ".join(topic for _, topic, _ in inputs)} can be set')
         self._worker = NewestWorker(self._answer)
         self.get_logger().info(f'listening to {", ".join(sorted(listener.topic_name for listener in self._inputs))}')
 

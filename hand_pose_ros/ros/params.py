@@ -160,10 +160,8 @@ def _declare(node: Node, row: Any) -> Any:
 
 
 def unknown(node: Node) -> list[str]:
-    """Names of parameters that were given at start and are none of ours, nor any that rclpy declares later."""
-    ours = {ros_name(row) for row in fields(Params)}
-    return [name for name in _overrides(node) if name not in ours and name != 'use_sim_time'
-            and not name.startswith('qos_') and not name.startswith('start_type_description_service')]
+    """Names of parameters that were given at start and that nobody has declared so far."""
+    return [name for name in _overrides(node) if not node.has_parameter(name)]
 
 
 def _overrides(node: Node) -> dict[str, Parameter]:

@@ -29,7 +29,7 @@ from hand_pose_ros.geometry import Cube, Intrinsics, crop
 from hand_pose_ros.models import build
 from hand_pose_ros.models.checkpoints import load_checkpoint, save_checkpoint
 from hand_pose_ros.models.prior import fit_prior
-from hand_pose_ros.skeleton import HAND21, Skeleton, get_skeleton
+from hand_pose_ros.skeleton import HAND21, SKELETONS, Skeleton, get_skeleton
 from hand_pose_ros.training import experiments
 from hand_pose_ros.training.augmentation import PRESETS, Augmentation, augment
 from hand_pose_ros.training.folder import RunFolder, TrainingError
@@ -683,7 +683,7 @@ def test_the_finder_of_hands_learns_from_whole_scenes(folder, tmp_path):
         tiny(folder, 'network=hand_finder', 'options={}', out=tmp_path / 'never')
 
 
-def test_a_network_starts_from_another_and_gets_a_prior_if_that_had_none(folder, tmp_path):
+def test_a_network_starts_from_another_and_gets_a_prior_if_that_had_none(folder, tmp_path, monkeypatch):
     plain = tmp_path / 'plain.safetensors'
     facts = {'skeleton': 'icvl16', 'cube_side': 0.3}
     save_checkpoint(plain, build('hand_dense', joints=16, width=8), facts, half=False)
@@ -705,6 +705,13 @@ def test_a_network_starts_from_another_and_gets_a_prior_if_that_had_none(folder,
     assert all(torch.equal(one, other) for one, other in pairs)
     with pytest.raises(TrainingError, match='holds another network than the recipe names'):
         tiny(folder, f'base={path}', out=tmp_path / 'third')
+    # As many joints, but others: neither they nor their prior would be those of the dataset.
+    save_checkpoint(path, first, {**facts, 'skeleton': 'other16'}, half=False)
+    monkeypatch.setitem(SKELETONS, 'other16', replace(get_skeleton('icvl16'), name='other16'))
+    with pytest.raises(TrainingError, match='gives joints of other16, but icvl has those of icvl16'):
+        tiny(folder, *wanted, f'base={path}', out=tmp_path / 'fourth')
+    with pytest.raises(TrainingError, match='need a hand_dense of these joints as the first'):
+        tiny(folder, 'network=two_looks', f'first={path}', out=tmp_path / 'fifth')
 
 
 def test_a_network_with_further_blocks_and_a_refinement_starts_as_the_one_it_grew_from(folder, tmp_path):

@@ -54,6 +54,9 @@ def make_objective(recipe: Recipe, base: Checkpoint | None, shards: DiskShards |
         TrainingError: parts of the recipe, or its base, do not go together.
     """
     skeleton = shards.dataset.skeleton
+    if base and base.metadata['skeleton'] != skeleton.name and recipe.network != 'center_refiner':  # a palm is a palm
+        raise TrainingError(f'{recipe.base} gives joints of {base.metadata["skeleton"]}, but {recipe.dataset} has '
+                            f'those of {skeleton.name}: choose a base of the same')
     if recipe.refiner:
         return _refiner_objective(recipe, base, skeleton)
     network = _make_network(recipe, base, skeleton)
@@ -74,9 +77,6 @@ def _refiner_objective(recipe: Recipe, base: Checkpoint | None, skeleton: Skelet
         raise TrainingError('a refiner needs the checkpoint that it corrects: --set base=FILE')
     if recipe.refiner not in REFINERS:
         raise TrainingError(f'--set refiner={recipe.refiner}: choose one of {", ".join(REFINERS)}')
-    if base.metadata['skeleton'] != skeleton.name:
-        raise TrainingError(f'{recipe.base} gives joints of {base.metadata["skeleton"]}, but {recipe.dataset} '
-                            f'has those of {skeleton.name}: a refiner needs a base of the same')
     return RefinerObjective(build(recipe.refiner, joints=len(skeleton)), base.network, recipe, skeleton)
 
 
@@ -107,11 +107,12 @@ def _make_network(recipe: Recipe, base: Checkpoint | None, skeleton: Skeleton) -
 
 def _first_look(recipe: Recipe, base: Checkpoint | None, skeleton: Skeleton) -> HandDense:
     """The network that tells the second look where to look."""
-    of: nn.Module | None = load_checkpoint(recipe.first).network if recipe.first else None
+    of = load_checkpoint(recipe.first) if recipe.first else None
     if of is None and base is not None and isinstance(base.network, TwoLooks):
-        of = base.network
-    first = of.first if isinstance(of, TwoLooks) else of
-    if not isinstance(first, HandDense) or first.joints != len(skeleton):
+        of = base
+    first = of.network if of else None
+    first = first.first if isinstance(first, TwoLooks) else first
+    if of is None or not isinstance(first, HandDense) or of.metadata['skeleton'] != skeleton.name:
         raise TrainingError(f'two_looks of {skeleton.name} need a hand_dense of these joints as the first: '
                             '--set first=FILE')
     return first

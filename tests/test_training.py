@@ -361,6 +361,10 @@ def test_the_prior_comes_from_the_training_poses_and_is_trained_on_unless_the_re
         torch.testing.assert_close((centred @ start.double()) @ start.T.double(), centred, atol=1e-5, rtol=0)
         run.train()
         assert torch.equal(head.reconstruction.weight.detach(), start) != trained_on
+    # And where the network has a bottleneck of its own, of 30, that nobody asked for.
+    run = tiny(folder, 'network=deep_prior', 'options={}', 'samples=16', out=tmp_path / 'unasked')
+    components = run.objective.network.head.reconstruction.weight.T
+    torch.testing.assert_close(components @ components.T, torch.eye(30), atol=1e-5, rtol=0)
 
 
 def same_state(a: Path, b: Path) -> bool:

@@ -62,7 +62,7 @@ def make_objective(recipe: Recipe, base: Checkpoint | None, shards: DiskShards |
     network = _make_network(recipe, base, skeleton)
     objective = objective_for(network, recipe, skeleton)
     has_prior = base is not None and _start_from(network, base, recipe)
-    bottleneck = recipe.options.get('bottleneck')
+    bottleneck = vars(network)['config'].get('bottleneck')  # which some have without being asked
     if bottleneck and not has_prior:
         prior = fit_prior(_training_poses(objective, shards.read(first), recipe), bottleneck)
         network.set_prior(prior.mean, prior.components)  # type: ignore[operator]

@@ -810,7 +810,8 @@ def test_experiments_train_what_is_missing_and_write_table_plot_and_json(folder,
     monkeypatch.setattr(experiments, 'WIDTHS', (None, 8, 30))
     monkeypatch.setattr(experiments, 'ITERATIONS', 2)
     monkeypatch.setattr(experiments, 'ROUNDS', 1)
-    sets = [part for item in (*TINY, f'root={folder}', 'samples=24', 'last_shard=3') for part in ('--set', item)]
+    changes = (*TINY, 'options.dropout=0.1', f'root={folder}', 'samples=24', 'last_shard=3')
+    sets = [part for item in changes for part in ('--set', item)]
     monkeypatch.chdir(tmp_path.parent)
     arguments = ['--out', tmp_path.name, '--workers', '0', '--threads', '1', *sets]
     for name in ('bottleneck', 'refinement', 'joints', 'qualitative', 'runtime'):
@@ -820,6 +821,8 @@ def test_experiments_train_what_is_missing_and_write_table_plot_and_json(folder,
         assert (tmp_path / f'{name}.md').read_text().count('|') > 20
     runs = {path.name: (path / 'state.safetensors').stat().st_mtime_ns for path in (tmp_path / 'runs').iterdir()}
     assert runs.keys() == {'deep-direct', 'deep-8', 'deep-30', 'deep-30-std_ref', 'deep-30-or_ref'}
+    assert load_checkpoint(tmp_path / 'runs' / 'deep-8' / 'last.safetensors').network.config == {
+        'joints': 16, 'bottleneck': 8, 'dropout': 0.1}
     results = json.loads((tmp_path / 'refinement.json').read_text())['results']
     assert [result['name'] for result in results] == [
         'deep-30', 'deep-30 + std_ref x1', 'deep-30 + std_ref x2', 'deep-30 + or_ref x1', 'deep-30 + or_ref x2']

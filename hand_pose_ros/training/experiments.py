@@ -80,7 +80,11 @@ class Laboratory:
         return load_checkpoint(folder.checkpoint('last'))
 
     def network(self, architecture: str, width: int | None) -> Checkpoint:
-        return self.train(label(architecture, width), network=architecture, options={'bottleneck': width})
+        return self.train(label(architecture, width), network=architecture, options=self.options(width))
+
+    def options(self, width: int | None) -> dict[str, Any]:
+        """Those of the recipe, with a bottleneck of this width."""
+        return {**self.recipe.options, 'bottleneck': width}
 
     def check_refiner(self) -> None:
         """Raise HandPoseError if nothing would be left to train a refiner on: now, not after the first trainings."""
@@ -262,7 +266,7 @@ def ingredients(lab: Laboratory) -> str:
         raise HandPoseError(f'--set dataset={lab.recipe.dataset}: only synthetic hands have ingredients to leave out')
     results = [lab.result('complete', lab.network('deep', 30))]
     for name in (*INGREDIENTS, 'everything'):
-        checkpoint = lab.train(f'deep-30-without-{name}', network='deep', options={'bottleneck': 30},
+        checkpoint = lab.train(f'deep-30-without-{name}', network='deep', options=lab.options(30),
                                dataset=f'synthetic:without-{name}')
         results.append(lab.result(f'without {name}', checkpoint))
     return lab.write_results('ingredients', results, plots.curves(results))

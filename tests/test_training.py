@@ -810,6 +810,7 @@ def test_experiments_train_what_is_missing_and_write_table_plot_and_json(folder,
     monkeypatch.setattr(experiments, 'WIDTHS', (None, 8, 30))
     monkeypatch.setattr(experiments, 'ITERATIONS', 2)
     monkeypatch.setattr(experiments, 'ROUNDS', 1)
+    monkeypatch.setattr(experiments, 'TEST_SAMPLES', 4)  # fewer than there are recorded ones: those are all taken
     changes = (*TINY, 'options.dropout=0.1', f'root={folder}', 'samples=24', 'last_shard=3')
     sets = [part for item in changes for part in ('--set', item)]
     monkeypatch.chdir(tmp_path.parent)

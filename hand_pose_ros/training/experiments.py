@@ -39,7 +39,7 @@ from hand_pose_ros.training.validation import estimate, first_samples
 log = logging.getLogger(__name__)
 
 TEST_SAMPLES = 5000
-"""At most; of synthetic hands these are synthetic-test-v1."""
+"""Of synthetic hands, which are then synthetic-test-v1; of a recorded dataset all test frames."""
 WIDTHS = (None, 2, 4, 8, 16, 30)
 """Of the bottleneck; None = direct regression."""
 ITERATIONS = 4
@@ -107,7 +107,7 @@ class Laboratory:
         """The test samples."""
         with closing(open_shards(self.recipe, self.machine, 'test', torch.device('cpu'))) as shards:
             log.info('preparing the test samples (%s)', shards.dataset.name)
-            return first_samples(shards, TEST_SAMPLES)
+            return first_samples(shards, shards.dataset.size or TEST_SAMPLES)
 
     def result(self, name: str, checkpoint: Checkpoint) -> Result:
         """What a network makes of the test samples, with the refiner of the checkpoint if it has one."""

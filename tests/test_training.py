@@ -644,6 +644,9 @@ def test_a_refiner_learns_from_what_its_base_has_not_seen(folder, tmp_path):
     assert list(run.stream.window(0)) == [2, 3]
     other = tiny(folder, 'refiner=or_ref', f'base={base}', 'shard_size=3', out=tmp_path / 'never')
     assert list(other.stream.window(0)) == [3, 4, 5]  # of 16 samples, of which the base has seen 8
+    tiny(folder, 'last_shard=1', 'samples=4', f'base={base}', out=tmp_path / 'on').train()  # what its base saw, it saw
+    behind = tiny(folder, 'refiner=or_ref', f'base={tmp_path / "on" / "last.safetensors"}', out=tmp_path / 'never')
+    assert list(behind.stream.window(0)) == [2, 3]
     run.train()
     refined, before = load_checkpoint(tmp_path / 'refined' / 'last.safetensors'), load_checkpoint(base)
     kept = refined.network.state_dict()

@@ -32,7 +32,7 @@ from hand_pose_ros.training.losses import Terms
 from hand_pose_ros.training.objectives import RefinerObjective
 from hand_pose_ros.training.optimizers import learning_rate, make_optimizer
 from hand_pose_ros.training.recipes import EPOCH_OF_ENDLESS_DATA, Recipe, recipe_to_dict
-from hand_pose_ros.training.start import first_shard, make_objective
+from hand_pose_ros.training.start import first_shard, make_objective, shards_seen
 from hand_pose_ros.training.state import load_state, save_state, save_tensors
 from hand_pose_ros.training.stream import SampleStream
 from hand_pose_ros.training.validation import estimate, first_samples
@@ -338,9 +338,11 @@ class Run:
             return first_samples(shards, self.recipe.val_samples)
 
     def _save_checkpoint(self, name: str, result: dict[str, Any]) -> None:
+        # What the base has seen, these weights have seen.
+        shards = max(self.stream.shards_used(self.step), shards_seen(self.recipe, self.base, self.shards.dataset))
         metadata = {'skeleton': self.skeleton.name, 'cube_side': self.shards.dataset.cube_side, 'validation': result,
                     'samples': self.step * self.recipe.batch_size, 'recipe': recipe_to_dict(self.recipe),
-                    'training_data': self.shards.dataset.name, 'training_shards': self.stream.shards_used(self.step)}
+                    'training_data': self.shards.dataset.name, 'training_shards': shards}
         if isinstance(self.averaged, RefinerObjective):
             assert self.base is not None
             save_checkpoint(self.folder.checkpoint(name), self.base.network, metadata, self.averaged.refiner)

@@ -31,15 +31,21 @@ def first_shard(recipe: Recipe, base: Checkpoint | None, data: Dataset) -> int:
         TrainingError: the base was trained on everything.
     """
     first = recipe.first_shard
-    if recipe.refiner and base and base.metadata.get('training_data') == data.name:
-        size = base.metadata.get('recipe', {}).get('shard_size', recipe.shard_size)
-        seen = int(base.metadata['training_shards']) * size
-        first = max(first, -(-seen // recipe.shard_size))
+    if recipe.refiner and (seen := shards_seen(recipe, base, data)):
+        first = max(first, seen)
         if data.size is not None and first * recipe.shard_size >= data.size:
             raise TrainingError(f'{recipe.base} was trained on all of {data.name}, so a refiner would learn '
                                 'from estimates that are better than in use: train the base with --set '
                                 'last_shard=N, which leaves the shards from N on to the refiner')
     return first
+
+
+def shards_seen(recipe: Recipe, base: Checkpoint | None, data: Dataset) -> int:
+    """One past the last shard, as large as the recipe says, that a base and what that started from were trained on."""
+    if base is None or base.metadata.get('training_data') != data.name:
+        return 0
+    size = base.metadata.get('recipe', {}).get('shard_size', recipe.shard_size)
+    return -(-int(base.metadata['training_shards']) * size // recipe.shard_size)
 
 
 def make_objective(recipe: Recipe, base: Checkpoint | None, shards: DiskShards | MemoryShards,

@@ -303,6 +303,15 @@ def test_training_hands_can_do_without_an_ingredient():
     assert held_out.fingerprint == open_dataset('synthetic', 'val').fingerprint
 
 
+def test_samples_of_other_code_are_not_those_of_a_cache(monkeypatch):
+    before, read = open_dataset('synthetic', 'val').fingerprint, Path.read_bytes
+    for changed in ('synthetic/generator.py', 'datasets/synthetic.py'):
+        def as_changed(path: Path, name: str = changed) -> bytes:
+            return read(path) + (b'#' if path.as_posix().endswith(name) else b'')
+        monkeypatch.setattr(Path, 'read_bytes', as_changed)
+        assert open_dataset('synthetic', 'val').fingerprint != before
+
+
 def test_synthetic_hands_are_right_hands_to_the_network():
     from hand_pose_ros.synthetic.generator import SyntheticHands
     scene = SyntheticHands('val').batch(torch.arange(16))

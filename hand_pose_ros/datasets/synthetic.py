@@ -104,7 +104,7 @@ class SyntheticScenes(Dataset):
 def _code() -> str:
     """Any change of the code that makes the samples makes other samples."""
     sources = sorted(Path(hand_pose_ros.synthetic.__path__[0]).glob('*.py'))
-    return hashlib.sha256(b''.join(path.read_bytes() for path in sources)).hexdigest()[:12]
+    return hashlib.sha256(b''.join(path.read_bytes() for path in (*sources, Path(__file__)))).hexdigest()[:12]
 
 
 def _ingredients(variant: str) -> Ingredients | None:

@@ -648,6 +648,7 @@ def test_a_refiner_learns_from_what_its_base_has_not_seen(folder, tmp_path):
     behind = tiny(folder, 'refiner=or_ref', f'base={tmp_path / "on" / "last.safetensors"}', out=tmp_path / 'never')
     assert list(behind.stream.window(0)) == [2, 3]
     run.train()
+    assert 'or_ref on icvl-train' in (tmp_path / 'refined' / 'log.txt').read_text()
     refined, before = load_checkpoint(tmp_path / 'refined' / 'last.safetensors'), load_checkpoint(base)
     kept = refined.network.state_dict()
     assert all(torch.equal(kept[key], value) for key, value in before.network.state_dict().items())

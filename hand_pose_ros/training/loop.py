@@ -174,8 +174,9 @@ class Run:
             self.folder.create(self.recipe)
         if self.rank == 0:
             self.folder.open(self.step, self.step * self.recipe.batch_size)
-            log.info('%s on %s, step %s of %s, %s samples each; the recipe is in %s/config.json', self.recipe.network,
-                     self.shards.dataset.name, self.step, self.steps, self.recipe.batch_size, self.folder.path)
+            log.info('%s on %s, step %s of %s, %s samples each; the recipe is in %s/config.json',
+                     self.recipe.refiner or self.recipe.network, self.shards.dataset.name, self.step, self.steps,
+                     self.recipe.batch_size, self.folder.path)
 
     def _loop(self, module: nn.Module) -> dict[str, Any]:
         recipe = self.recipe

@@ -206,6 +206,16 @@ def test_wheel_with_messages(source: Path, tmp_path: Path) -> None:
     check_installation(prefix, site_packages)
 
 
+def test_source_distribution_has_all_that_its_pages_and_tests_name(tmp_path: Path) -> None:
+    pytest.importorskip('hand_pose_ros.msg', reason='the tools that make the messages are not installed')
+    run(sys.executable, 'setup.py', '-q', 'egg_info', '--egg-base', tmp_path, cwd=CHECKOUT)
+    listed = set((tmp_path / 'hand_pose_ros.egg-info' / 'SOURCES.txt').read_text().split())
+    folders = ('benchmarks', 'docs', 'examples', 'scripts', 'tests')
+    files = {path.relative_to(CHECKOUT).as_posix() for folder in folders for path in (CHECKOUT / folder).rglob('*')
+             if path.is_file() and path.suffix != '.pyc'}
+    assert files | set(SHARED) | set(FILES) <= listed
+
+
 def test_pure_wheel_beside_a_ros_that_is_not_from_wheels(source: Path, tmp_path: Path) -> None:
     """With another ROS sourced the messages are for colcon to build, and the wheel holds everything else."""
     (tmp_path / 'opt/ros/share/rclpy').mkdir(parents=True)

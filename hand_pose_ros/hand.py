@@ -13,7 +13,7 @@ from hand_pose_ros.geometry import Cube
 Side = Literal['left', 'right', 'unknown']
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # arrays cannot tell in one word whether they are equal
 class HandEstimate:
     """One hand in one image.
 

@@ -150,6 +150,13 @@ def test_two_hands_are_found_at_once_and_keep_their_names(sequence_of_two):
     assert all(np.linalg.norm(np.subtract(*(hand.cube.center for hand in hands))) > 0.15 for hands in images)
 
 
+def test_hands_are_told_apart_by_what_they_are(sequence_of_two):
+    hands = HandPoseEstimator.from_pretrained(DEFAULT, device='cpu', max_hands=2)(
+        sequence_of_two[0].depth, sequence_of_two[0].intrinsics)
+    assert [hands.index(hand) for hand in hands] == [0, 1]
+    assert len(set(hands)) == 2
+
+
 def test_fewer_hands_are_followed_when_fewer_are_wanted(sequence_of_two):
     estimator = HandPoseEstimator.from_pretrained(DEFAULT, device='cpu', max_hands=2)
     counts = []

@@ -159,7 +159,8 @@ def to_units(depth: NDArray[np.float32], depth_scale: float = 0.001) -> NDArray[
 
 def encode_png(units: NDArray[np.uint16]) -> bytes:
     """Sensor units (H, W) -> a 16-bit greyscale PNG."""
-    return cv2.imencode('.png', units)[1].tobytes()
+    native = np.asarray(units, np.uint16)  # OpenCV takes any order of bytes for that of this machine
+    return cv2.imencode('.png', native)[1].tobytes()
 
 
 def encode_rvl(units: NDArray[np.uint16]) -> bytes:

@@ -149,6 +149,7 @@ def crop(depth: NDArray[np.float32], cube: Cube, intrinsics: Intrinsics, size: i
     affine = np.array([[intrinsics.fx * step, 0, u + intrinsics.fx * step * (0.5 - size / 2)],
                        [0, intrinsics.fy * step, v + intrinsics.fy * step * (0.5 - size / 2)]])
     patch = np.empty((size, size), np.float32)
+    depth = np.asarray(depth, np.float32)  # given another type, OpenCV leaves `patch` as it is
     cv2.warpAffine(depth, affine, (size, size), dst=patch, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
                    borderMode=cv2.BORDER_CONSTANT, borderValue=0)
     nothing = ~(patch > 0)  # NaN, too

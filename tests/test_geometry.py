@@ -76,6 +76,13 @@ def test_what_a_patch_shows_of_a_plane(reading, value):
     assert np.allclose(patch, value, atol=1e-6)
 
 
+@pytest.mark.parametrize('kind', ['f8', '>f4'])
+def test_a_patch_is_the_same_of_any_type_of_depth(kind):
+    depth = np.linspace(0.6, 0.9, 480 * 640, dtype=np.float32).reshape(480, 640)
+    cube = Cube((0.0, 0.0, 0.75), 0.3)
+    assert np.array_equal(crop(depth.astype(kind), cube, VGA), crop(depth, cube, VGA))
+
+
 def test_outside_the_image_is_background():
     depth = np.full((480, 640), 0.5, np.float32)
     x = (0 - 320) / 588.03 * 0.5

@@ -83,6 +83,11 @@ def test_depth_and_camera_come_back_as_written(tmp_path, depths, name, codec):
     assert frames[0].topic == f'/{BASE}' + ('/compressedDepth' if codec else '')
 
 
+@pytest.mark.parametrize('codec', [None, 'png', 'rvl'])
+def test_images_come_back_as_written_in_whatever_order_they_lie_in_memory(tmp_path, depths, codec):
+    assert_same(write(tmp_path / 'bag.mcap', [np.asfortranarray(depth) for depth in depths], codec), depths)
+
+
 def test_sqlite3_folder(tmp_path, depths):
     path = write(tmp_path / 'folder', depths, storage='sqlite3')
     assert list(path.glob('*.db3')) and (path / 'metadata.yaml').is_file()

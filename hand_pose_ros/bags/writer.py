@@ -98,7 +98,7 @@ class BagWriter:
         info = self._camera_info(header, intrinsics)
         self.write(camera_info_beside(topic), CAMERA_INFO, info, stamp_ns)
         if codec is None:
-            units = to_units(depth).astype('<u2')
+            units = to_units(depth).astype('<u2', order='C')
             height, width = units.shape
             self.write(topic, IMAGE, self._types[IMAGE](
                 header=header, height=height, width=width, encoding='16UC1', is_bigendian=0, step=2 * width,

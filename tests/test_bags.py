@@ -88,6 +88,16 @@ def test_images_come_back_as_written_in_whatever_order_they_lie_in_memory(tmp_pa
     assert_same(write(tmp_path / 'bag.mcap', [np.asfortranarray(depth) for depth in depths], codec), depths)
 
 
+@pytest.mark.parametrize('name', ['bag.mcap', 'bag.db3'])
+def test_stamps_may_be_those_of_an_array(tmp_path, depths, name):
+    with BagWriter(tmp_path / name) as bag:
+        for stamp, depth in zip(np.array(STAMPS), depths, strict=True):
+            bag.write_depth(stamp, 'camera_optical', depth, CAMERA)
+            bag.write_hands(stamp, 'camera_optical', [hand(0)])
+    assert_same(tmp_path / name, depths)
+    assert [hands.stamp_ns for hands in read_hands(tmp_path / name)] == STAMPS
+
+
 def test_sqlite3_folder(tmp_path, depths):
     path = write(tmp_path / 'folder', depths, storage='sqlite3')
     assert list(path.glob('*.db3')) and (path / 'metadata.yaml').is_file()

@@ -83,7 +83,7 @@ class BagWriter:
                       _FOREVER, _FOREVER, QosLiveliness.AUTOMATIC, _FOREVER, avoid_ros_namespace_conventions=False)
             self._connections[topic] = self._writer.add_connection(
                 topic, msgtype, typestore=typestore(), offered_qos_profiles=[qos])
-        self._writer.write(self._connections[topic], stamp_ns, data)
+        self._writer.write(self._connections[topic], int(stamp_ns), data)  # rosbags takes no integers of numpy
 
     def write_depth(self, stamp_ns: int, frame_id: str, depth: NDArray[np.float32], intrinsics: Intrinsics, *,
                     topic: str = '/depth/image_rect', codec: str | None = 'png') -> None:

@@ -334,6 +334,12 @@ def test_a_folder_where_a_bag_of_one_file_is_to_be_is_refused_at_once(tmp_path):
         Bag(tmp_path / 'bag.mcap')
 
 
+def test_unknown_storage_is_named_and_leaves_nothing(tmp_path):
+    with pytest.raises(InputError, match="unknown storage 'sqlite': choose mcap or sqlite3"):
+        BagWriter(tmp_path / 'folder', storage='sqlite')
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_bag_appears_only_when_it_is_complete(tmp_path, depths):
     path = tmp_path / 'bag.mcap'
     path.write_text('what was there before')

@@ -39,7 +39,7 @@ class BagWriter:
         storage: 'mcap' or 'sqlite3', for a folder.
 
     Raises:
-        InputError: the folder exists already, or cannot be written.
+        InputError: the folder exists already, or cannot be written, or there is no such storage.
     """
 
     def __init__(self, path: str | os.PathLike[str], storage: str = 'mcap') -> None:
@@ -47,6 +47,8 @@ class BagWriter:
         self._is_file = self.path.suffix in ('.mcap', '.db3')
         if self._is_file:
             storage = 'mcap' if self.path.suffix == '.mcap' else 'sqlite3'
+        if storage not in ('mcap', 'sqlite3'):
+            raise InputError(f"{self.path}: unknown storage '{storage}': choose mcap or sqlite3")
         if self.path.is_dir() or (self.path.exists() and not self._is_file):
             raise InputError(f'{self.path}: there is something already: give another name for the bag, or remove it')
         try:

@@ -334,6 +334,26 @@ def test_a_folder_where_a_bag_of_one_file_is_to_be_is_refused_at_once(tmp_path):
         Bag(tmp_path / 'bag.mcap')
 
 
+def test_a_bag_that_was_closed_is_not_called_damaged(tmp_path, depths):
+    with DepthBag(write(tmp_path / 'bag.mcap', depths)) as bag:
+        frames = iter(bag)
+        next(frames)
+        bag.close()
+    for read in (lambda: next(frames), lambda: list(bag), lambda: bag.first(bag.connections[0])):
+        with pytest.raises(InputError, match=r'bag\.mcap: the bag was closed'):
+            read()
+
+
+def test_a_bag_may_be_closed_or_given_up_before_its_block_ends(tmp_path):
+    with BagWriter(tmp_path / 'closed.mcap') as bag:
+        bag.write_hands(1, 'camera', [hand(0)])
+        bag.close()
+    assert len(read_hands(tmp_path / 'closed.mcap')) == 1
+    with BagWriter(tmp_path / 'given_up.mcap') as bag:
+        bag.abort()
+    assert [path.name for path in tmp_path.iterdir()] == ['closed.mcap']
+
+
 def test_unknown_storage_is_named_and_leaves_nothing(tmp_path):
     with pytest.raises(InputError, match="unknown storage 'sqlite': choose mcap or sqlite3"):
         BagWriter(tmp_path / 'folder', storage='sqlite')

@@ -53,6 +53,7 @@ class Bag:
         self.is_ros1 = not self._reader.is2
         self.typestore: Typestore = self._reader.typestore
         self.start_ns: int = self._reader.start_time
+        self._closed = False
 
     def messages(self, connections: Collection[Connection],
                  start: int | None = None) -> Iterator[tuple[Connection, int, bytes]]:
@@ -70,6 +71,7 @@ class Bag:
                 yield message
                 count += 1
         except Exception as error:  # errors of sqlite and of the decompressors come through as they are
+            self._check_open()
             raise InputError(f'{self.path}: the bag is damaged after {count} messages ({error}); '
                              f'{_remedy(self.path)}') from error
         if self._interrupted:
@@ -90,6 +92,7 @@ class Bag:
         try:
             return self._reader.deserialize(data, connection.msgtype)
         except Exception as error:  # whatever random bytes provoke
+            self._check_open()
             if bytes(data[:4]) == b'\x28\xb5\x2f\xfd':  # of zstd; only metadata.yaml tells that messages are compressed
                 raise InputError(f'{self.path}: its messages are compressed, as metadata.yaml says: give the folder '
                                  'that holds both, or make it anew with: ros2 bag reindex FOLDER') from error
@@ -98,7 +101,13 @@ class Bag:
 
     def close(self) -> None:
         """Close the files; the bag cannot be read any more."""
-        self._reader.close()
+        if not self._closed:
+            self._closed = True
+            self._reader.close()
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise InputError(f'{self.path}: the bag was closed: read it inside its `with` block')
 
     def __enter__(self: _Self) -> _Self:
         return self

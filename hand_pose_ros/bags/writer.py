@@ -135,6 +135,8 @@ class BagWriter:
 
     def close(self) -> None:
         """Complete the bag and move it into place."""
+        if not self._work.exists():  # it was closed or given up before
+            return
         made = self._writer.path
         try:
             with naming_full_disk(self.path):

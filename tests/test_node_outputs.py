@@ -240,12 +240,12 @@ def test_joints_in_the_target_frame(rig: Rig, monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_hands_are_looked_for_in_the_region_that_is_given(rig: Rig) -> None:
-    rig.start(detector='region', tracking=False)
+    rig.start('hand/region:=/where/hands/are', detector='region', tracking=False)
     publish = rig.camera(info=camera_info())
     scene = image(two_hands(left=0.55, right=0.65))
     assert rig.answer(publish, scene).hands == []
-    rig.until_said('hand/region', 'no region arrived', 'detector')
-    regions = rig.client.create_publisher(RegionOfInterest, 'hand/region', RELIABLE)
+    rig.until_said('no region arrived on /where/hands/are', 'detector')
+    regions = rig.client.create_publisher(RegionOfInterest, '/where/hands/are', RELIABLE)
     rig.connected(regions)
 
     def found(region: RegionOfInterest) -> list[float]:

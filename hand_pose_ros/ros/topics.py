@@ -21,8 +21,8 @@ except ImportError:  # ROS 2 Humble
 
 IMAGE, CAMERA_INFO, REGION = 'depth/image_rect', 'depth/camera_info', 'hand/region'
 
-NO_REGION = (f'no region arrived on {REGION}, so no hand is looked for: publish where it is in the depth image, or set '
-             'the parameter detector to network')
+NO_REGION = ('no region arrived on {}, so no hand is looked for: publish where it is in the depth image, or set the '
+             'parameter detector to network')
 
 
 def input_topics(node: Node, transport: str) -> tuple[str, str]:

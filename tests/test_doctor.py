@@ -80,6 +80,16 @@ def test_without_ros_all_else_is_examined(weights: Path, monkeypatch: pytest.Mon
     assert code == 1 and 'jazzy is sourced, but' in about['ROS 2'][0]
 
 
+@pytest.mark.parametrize('name, value', [('ROS_DOMAIN_ID', 'seven'), ('RMW_IMPLEMENTATION', 'rmw_of_nobody')])
+def test_an_environment_in_which_no_node_starts(name: str, value: str, weights: Path, monkeypatch: pytest.MonkeyPatch,
+                                                capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip('hand_pose_ros.msg', reason='needs ROS 2 and the compiled messages')
+    monkeypatch.setenv(name, value)
+    code, about = report(capsys)
+    assert code == 1 and about['ROS 2'][0].startswith('WRONG: no node can be started')
+    assert f'{name}={value}' in about['ROS 2'][0]
+
+
 def test_a_library_that_cannot_be_imported(weights: Path, monkeypatch: pytest.MonkeyPatch,
                                            capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setitem(sys.modules, 'rosbags', None)

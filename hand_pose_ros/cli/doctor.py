@@ -9,6 +9,7 @@ import importlib.util
 import os
 import platform
 import shutil
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -127,16 +128,29 @@ def _ros() -> Findings:
             yield 'note', ('none: the node, replay and demo need it, all else works; source its setup file, or in the '
                            "checkout: pip install '.[ros]'")
         return
+    settings = [f'{name}={os.environ[name]}' for name in (
+        'RMW_IMPLEMENTATION', 'ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'ROS_LOCALHOST_ONLY')
+        if name in os.environ]
+    if failure := _ros_failure():
+        remedy = f'; correct or unset {", ".join(settings)}' if settings else ''
+        yield 'WRONG', f'no node can be started: {failure}{remedy}'
+        return
     from hand_pose_ros.ros.qos import middleware
+    yield 'ok', ', '.join([distro or 'from wheels', middleware(), 'messages built', *settings])
 
-    settings = {name: os.environ[name] for name in (
-        'ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'ROS_LOCALHOST_ONLY') if name in os.environ}
-    yield 'ok', ', '.join([distro or 'from wheels', middleware(), 'messages built',
-                           *(f'{name}={value}' for name, value in settings.items())])
+
+def _ros_failure() -> str:
+    """Why no node can be started, empty if one can. It is tried in a process of its own, which ROS may end."""
+    code = ('import sys\nfrom hand_pose_ros.errors import HandPoseError\ntry:\n    from hand_pose_ros import ros\n'
+            '    import rclpy\n    ros.init()\n    rclpy.create_node("doctor")\n'
+            'except HandPoseError as error:\n    sys.exit(str(error))')
+    tried = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
+    said = [line for line in tried.stderr.splitlines() if line.strip()] or [f'exit code {tried.returncode}']
+    return said[-1] if tried.returncode else ''
 
 
 def _dds_profile() -> Findings:
-    if importlib.util.find_spec('rclpy') is None:
+    if importlib.util.find_spec('rclpy') is None or _ros_failure():
         return
     from hand_pose_ros.ros.qos import PROFILE_VARIABLES, large_image_profile, middleware
 

@@ -202,8 +202,11 @@ def test_topics_that_are_not_there_are_named(bag, listener, play):
 
 
 def test_the_command_publishes_and_counts(bag, ros_domain, capsys):
-    assert main(['replay', str(bag), '--rate', '100', '--wait', '0', '--ros-args', '-r', '__ns:=/robot']) == 0
-    assert '12  /depth/image_rect' in capsys.readouterr().out
+    assert main(['replay', str(bag), '--rate', '100', '--wait', '0', '--ros-args', '-r', '__ns:=/robot',
+                 '-r', '/depth/image_rect:=/front/depth']) == 0
+    said = capsys.readouterr().out
+    assert 'publishing /depth/camera_info, /front/depth, /' in said and '12  /front/depth' in said
+    assert '/depth/image_rect' not in said
     assert main(['replay', str(bag.with_name('missing.bag'))]) == 1
     assert 'missing.bag: there is no such bag' in capsys.readouterr().err
     for option, value in (('--rate', '0'), ('--start', '-1'), ('--start', 'nan'), ('--start', 'inf'),

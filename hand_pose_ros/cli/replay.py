@@ -52,8 +52,8 @@ def run(args: argparse.Namespace) -> int:
 
     with replaying(args.bag, args.ros_args, topics=args.topics, rate=args.rate, reliability=args.qos, clock=args.clock,
                    paused=args.start_paused) as replay:
-        print(f'{args.bag}: publishing {", ".join(sorted(replay.published))} from in {args.wait:g} s on: subscribers '
-              'must find it first', flush=True)
+        topics = ', '.join(sorted(map(replay.name, replay.published)))
+        print(f'{args.bag}: publishing {topics} from in {args.wait:g} s on: subscribers must find it first', flush=True)
         code = 0
         try:
             replay.wait_for_subscribers(args.wait)
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
         except KeyboardInterrupt:
             code = int(not args.loop)  # it is how a loop ends
         finally:
-            for topic, count in sorted(replay.published.items()):
+            for topic, count in sorted((replay.name(topic), count) for topic, count in replay.published.items()):
                 print(f'{count:7d}  {topic}')
             print(f'no message was published more than {1000 * replay.lateness_s:.0f} ms after its time')
     return code

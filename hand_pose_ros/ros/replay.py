@@ -81,6 +81,10 @@ class Replay:
             raise InputError(f'{bag.path}: there is nothing to publish: no topic has messages of an installed type')
         self.node.create_service(SetBool, '~/pause', self._on_pause)
 
+    def name(self, topic: str) -> str:
+        """What a topic of the bag is called where it is published: it may be remapped."""
+        return str(self._outputs[topic].topic_name)
+
     def wait_for_subscribers(self, timeout_s: float, number: int | None = None) -> None:
         """Give subscribers time to find the topics: what is published earlier never reaches them.
 

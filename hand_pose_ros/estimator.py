@@ -49,8 +49,8 @@ FRAME_S = 1 / 30
 SIDE_MEMORY = 0.95
 """What a hand has shown of its side fades by this factor each image: about twenty images decide."""
 SETTLED = 5.0
-"""A side that has shown itself by more than this (logits) is not doubted until that has faded: about every tenth
-image. The scores of networks that do not judge sides never get there."""
+"""A side that has shown itself by more than this (logits) is not doubted until that has faded: about every
+thirtieth image. The scores of networks that do not judge sides never get there."""
 USUAL_SIZE = 0.166
 """Metres from the wrist along the bones to the tip of the middle finger, of the hand that a usual cube is for."""
 SIZE_IMAGES = 10

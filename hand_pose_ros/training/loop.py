@@ -117,7 +117,7 @@ class Run:
         # Channels last is what fast convolutions of few channels want, and twice as fast for them on a CPU.
         with self._signals(), self._interruptible():
             try:
-                objective = make_objective(recipe, self.base, self.shards, self.stream.first).to(self.device)
+                objective = make_objective(recipe, self.base, self.shards, self.stream.window(0)).to(self.device)
             except BaseException:
                 self.shards.close()
                 raise

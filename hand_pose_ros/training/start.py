@@ -49,12 +49,13 @@ def shards_seen(recipe: Recipe, base: Checkpoint | None, data: Dataset) -> int:
 
 
 def make_objective(recipe: Recipe, base: Checkpoint | None, shards: DiskShards | MemoryShards,
-                   first: int) -> PoseObjective | RefinerObjective:
+                   window: range) -> PoseObjective | RefinerObjective:
     """The network of a recipe with its loss, as it is before the first step.
 
     Args:
         base: what `recipe.base` names.
-        shards: the training samples; the pose prior is fitted to those of number `first`.
+        shards: the training samples.
+        window: those that the first steps show, to which the pose prior is fitted: of a recorded dataset all.
 
     Raises:
         TrainingError: parts of the recipe, or its base, do not go together.
@@ -70,7 +71,7 @@ def make_objective(recipe: Recipe, base: Checkpoint | None, shards: DiskShards |
     has_prior = base is not None and _start_from(network, base, recipe)
     bottleneck = vars(network)['config'].get('bottleneck')  # which some have without being asked
     if bottleneck and not has_prior:
-        prior = fit_prior(_training_poses(objective, shards.read(first), recipe), bottleneck)
+        prior = fit_prior(_training_poses(objective, shards, window, recipe), bottleneck)
         network.set_prior(prior.mean, prior.components)  # type: ignore[operator]
         log.info('the prior keeps %.2f %% of the variance of the poses', 100 * prior.explained_variance_ratio.sum())
     if bottleneck and not recipe.train_prior:
@@ -147,10 +148,14 @@ def _start_from(network: nn.Module, base: Checkpoint, recipe: Recipe) -> bool:
     return not prior
 
 
-def _training_poses(objective: PoseObjective, samples: dict[str, Tensor], recipe: Recipe) -> Tensor:
-    """Poses as the network will meet them: one shard, augmented in several ways, is plenty for a covariance."""
-    samples = {key: value.cpu() for key, value in samples.items() if key != 'patch'}
-    count, turns = len(samples['joints']), 8
+def _training_poses(objective: PoseObjective, shards: DiskShards | MemoryShards, window: range,
+                    recipe: Recipe) -> Tensor:
+    """Poses as the network will meet them; a few are augmented in several ways, which is plenty for a covariance."""
+    shards.keep(window)
+    parts = [{key: value.cpu() for key, value in shards.read(shard).items() if key != 'patch'} for shard in window]
+    samples = {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
+    count = len(samples['joints'])
+    turns = max(1, min(8, 16_384 // count))
     numbers = torch.arange(turns * count).split(count)
     batches = [augment(samples, recipe.augmentation, some, recipe.seed) for some in numbers]
     return torch.cat([objective.poses(batch)[joints_count(batch)] for batch in batches])

@@ -41,6 +41,7 @@ from hand_pose_ros.training.optimizers import learning_rate, make_optimizer, ort
 from hand_pose_ros.training.recipes import RECIPES, get_recipe, recipe_from_dict, recipe_to_dict
 from hand_pose_ros.training.state import save_tensors
 from hand_pose_ros.training.stream import SampleStream
+from hand_pose_ros.training.validation import some_samples
 
 TINY = ('dataset=icvl', 'network=shallow', 'options.bottleneck=8', 'batch_size=4', 'shard_size=4', 'val_every=40',
         'samples=96')
@@ -118,6 +119,13 @@ def test_every_sample_is_used_equally_often_and_a_step_is_a_function_of_its_numb
     assert numbered(0, 2) | numbered(1, 2) == numbered(0, 1)  # which augments them alike
     later = stream(first=2)
     assert min(later.batch(0)[0]['joints']) >= 16
+
+
+@pytest.mark.parametrize(('size', 'count', 'expected'), [
+    (None, 10, range(10)), (37, 5, (0, 9, 18, 27, 36)), (37, 37, range(37)), (37, 99, range(37)), (37, 1, (0,))])
+def test_validation_is_on_samples_from_all_of_a_recording(size, count, expected):
+    batches = some_samples(MemoryShards(Numbered(size), 8), count)
+    assert torch.cat([batch['joints'] for batch in batches]).tolist() == list(expected)
 
 
 # Augmentation

@@ -34,7 +34,7 @@ from hand_pose_ros.training.folder import RunFolder
 from hand_pose_ros.training.loop import Machine, Run, open_shards
 from hand_pose_ros.training.recipes import Recipe
 from hand_pose_ros.training.state import load_progress
-from hand_pose_ros.training.validation import estimate, first_samples
+from hand_pose_ros.training.validation import estimate, some_samples
 
 log = logging.getLogger(__name__)
 
@@ -107,7 +107,7 @@ class Laboratory:
         """The test samples."""
         with closing(open_shards(self.recipe, self.machine, 'test', torch.device('cpu'))) as shards:
             log.info('preparing the test samples (%s)', shards.dataset.name)
-            return first_samples(shards, shards.dataset.size or TEST_SAMPLES)
+            return some_samples(shards, shards.dataset.size or TEST_SAMPLES)
 
     def result(self, name: str, checkpoint: Checkpoint) -> Result:
         """What a network makes of the test samples, with the refiner of the checkpoint if it has one."""

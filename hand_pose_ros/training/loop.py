@@ -35,7 +35,7 @@ from hand_pose_ros.training.recipes import EPOCH_OF_ENDLESS_DATA, Recipe, recipe
 from hand_pose_ros.training.start import first_shard, make_objective, shards_seen
 from hand_pose_ros.training.state import load_state, save_state, save_tensors
 from hand_pose_ros.training.stream import SampleStream
-from hand_pose_ros.training.validation import estimate, first_samples
+from hand_pose_ros.training.validation import estimate, some_samples
 
 log = logging.getLogger(__name__)
 
@@ -336,7 +336,7 @@ class Run:
     @cached_property
     def _validation(self) -> list[Batch]:
         with closing(self._val_shards) as shards, self._interruptible():
-            return first_samples(shards, self.recipe.val_samples)
+            return some_samples(shards, self.recipe.val_samples)
 
     def _save_checkpoint(self, name: str, result: dict[str, Any]) -> None:
         # What the base has seen, these weights have seen.

@@ -77,6 +77,7 @@ class Recipe:
 
     # Validation
     val_samples: int = 2048
+    """At most; of a recorded dataset they are spread over all that validates."""
     val_every: int = 65_536
     """Samples between two validations."""
 

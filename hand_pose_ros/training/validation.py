@@ -11,14 +11,18 @@ from hand_pose_ros.datasets import Batch, joints_in_metres
 from hand_pose_ros.datasets.shards import DiskShards, MemoryShards
 
 
-def first_samples(shards: DiskShards | MemoryShards, count: int) -> list[Batch]:
-    """The first `count` samples, or all where there are fewer, shard by shard."""
-    size = shards.dataset.size
-    count = count if size is None else min(count, size)
-    numbers = range(-(-count // shards.shard_size))
-    shards.keep(numbers)
-    batches = [shards.read(number) for number in numbers]
-    batches[-1] = {key: value[:count - numbers[-1] * shards.shard_size] for key, value in batches[-1].items()}
+def some_samples(shards: DiskShards | MemoryShards, count: int) -> list[Batch]:
+    """So many samples, shard by shard: of an endless dataset the first; of another, which is in the order of recording,
+    spread evenly over it, or all where there are no more."""
+    size, n = shards.dataset.size, shards.shard_size
+    numbers = torch.arange(count) if size is None else torch.linspace(
+        0, size - 1, min(count, size), dtype=torch.float64).round().long()
+    needed = (numbers // n).unique().tolist()
+    shards.keep(needed)
+    batches = []
+    for shard in needed:
+        rows = numbers[numbers // n == shard] - shard * n
+        batches.append({key: value[rows.to(value.device)] for key, value in shards.read(shard).items()})
     return batches
 
 

@@ -175,9 +175,16 @@ def test_the_prior_equals_a_singular_value_decomposition():
 def test_mistakes_are_named():
     with pytest.raises(HandPoseError, match=r'choose one of .*deep'):
         build('deeper')
-    for wrong in ({'blocks': 2}, {'blocks': (1, 'x', 1, 1)}, {'width': 'x'}, {'width': -8}):
+    for wrong in ({'blocks': 2}, {'blocks': (1, 'x', 1, 1)}, {'width': 'x'}):
         with pytest.raises(HandPoseError, match="'hand_dense' cannot be made with"):
             build('hand_dense', **wrong)
+    with pytest.raises(HandPoseError, match='refined no: give true or false'):  # which is no empty text, so as if true
+        build('hand_dense', refined='no')
+    for architecture in ('hand_dense', 'two_looks', 'hand_finder'):
+        with pytest.raises(HandPoseError, match='width -8: give at least'):
+            build(architecture, width=-8)
+        with pytest.raises(HandPoseError, match='width 0: give at least'):
+            build(architecture, width=0)
     with pytest.raises(HandPoseError, match='does not take depth: it takes joints'):
         build('deep', depth=3)
     with pytest.raises(HandPoseError, match='without a bottleneck'):

@@ -86,7 +86,8 @@ class HandDense(nn.Module):
         refined: whether the joints are refined.
 
     Raises:
-        HandPoseError: there are not four stages of at least one block.
+        HandPoseError: there are not four stages of at least one block, the width is none, or `refined` neither true nor
+            false.
     """
 
     outputs = ('joints', 'confidence', 'hand', 'side', 'size')
@@ -96,6 +97,10 @@ class HandDense(nn.Module):
         super().__init__()
         if len(blocks) != 4 or min(blocks) < 1:
             raise HandPoseError(f'blocks {list(blocks)}: give four numbers, each at least 1')
+        if width < 1:
+            raise HandPoseError(f'width {width}: give at least 1')
+        if not isinstance(refined, bool):  # 'no' would be true
+            raise HandPoseError(f'refined {refined}: give true or false')
         self.joints, self.width, self.bottleneck, self.blocks, self.refined = (
             joints, width, bottleneck, list(blocks), refined)
         w = width

@@ -11,6 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.models.dense import Residual, conv_norm, pyramid
 
 FOCAL = 128.0
@@ -43,10 +44,15 @@ class HandFinder(nn.Module):
 
     Args:
         width: channels of the maps.
+
+    Raises:
+        HandPoseError: there are less than two.
     """
 
     def __init__(self, width: int = 24) -> None:
         super().__init__()
+        if width < 2:
+            raise HandPoseError(f'width {width}: give at least 2')
         w = width
         self.stem = nn.Sequential(conv_norm(3, w // 2, 5, stride=2), nn.ReLU(),
                                   conv_norm(w // 2, w, 3, stride=2), nn.ReLU())

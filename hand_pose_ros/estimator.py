@@ -287,7 +287,7 @@ class HandPoseEstimator:
             if mirrored[shown]:
                 coordinates[:, 0] *= -1
             size = 0.0
-            if 'size' in answer:
+            if 'size' in answer and self.skeleton.has_wrist:  # else it has not learned what it tells
                 size = float(answer['size'][shown]) + math.log(TOLD_SIZE * cube.side / USUAL_SIZE)
             return _Reading(cube, cube.from_cube(coordinates), confidence[shown], float(score[shown]), rightness, size)
 

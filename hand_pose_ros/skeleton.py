@@ -42,8 +42,13 @@ class Skeleton:
         return self.parents.index(-1)
 
     @property
+    def has_wrist(self) -> bool:
+        """Whether the fingers begin there; if at the palm, bones do not tell the length of a hand."""
+        return self.joint_names[self.root] == 'wrist'
+
+    @property
     def middle_finger(self) -> tuple[int, ...]:
-        """Indices from its tip to the root: the bones between them make the length of a hand."""
+        """Indices from its tip to the root: the bones between them make the length of a hand, if `has_wrist`."""
         chain = [self.joint_names.index('middle_tip')]
         while self.parents[chain[-1]] >= 0:
             chain.append(self.parents[chain[-1]])

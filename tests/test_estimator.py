@@ -11,8 +11,8 @@ import pytest
 from hand_pose_ros.errors import CheckpointError, InputError
 from hand_pose_ros.estimator import HandPoseEstimator
 from hand_pose_ros.geometry import Cube, Intrinsics
-from hand_pose_ros.models.checkpoints import DEFAULT, available
-from hand_pose_ros.skeleton import HAND21
+from hand_pose_ros.models.checkpoints import DEFAULT, available, load_checkpoint, save_checkpoint
+from hand_pose_ros.skeleton import HAND21, SKELETONS
 from hand_pose_ros.synthetic.generator import SyntheticHands
 
 KINECT2 = Intrinsics(363.9, 363.9, 255.4, 206.3, 512, 424)
@@ -130,6 +130,15 @@ def test_the_cube_of_a_tracked_hand_fits_it_unless_its_size_was_given(sequence):
     usual = sides()
     assert usual[0] == 0.3 and len(set(usual)) > 10
     assert max(abs(np.diff(usual))) < 0.01 and 0.24 < min(usual) < max(usual) < 0.37
+
+
+def test_the_cube_stays_where_joints_do_not_tell_the_size_of_a_hand(sequence, tmp_path, monkeypatch):
+    names = ('palm', *HAND21.joint_names[1:])
+    monkeypatch.setitem(SKELETONS, 'palm21', replace(HAND21, name='palm21', joint_names=names))
+    whole, path = load_checkpoint(DEFAULT), tmp_path / 'palm.safetensors'
+    save_checkpoint(path, whole.network, {**whole.metadata, 'skeleton': 'palm21'})
+    estimator = HandPoseEstimator.from_pretrained(path, device='cpu')
+    assert {hand.cube.side for frame in sequence for hand in estimator(frame.depth, frame.intrinsics)} == {0.3}
 
 
 @pytest.fixture(scope='module')

@@ -29,6 +29,7 @@ from hand_pose_ros.geometry import Cube, Intrinsics, crop
 from hand_pose_ros.models import build
 from hand_pose_ros.models.checkpoints import load_checkpoint, save_checkpoint
 from hand_pose_ros.models.prior import fit_prior
+from hand_pose_ros.models.two_looks import ZOOM
 from hand_pose_ros.skeleton import HAND21, SKELETONS, Skeleton, get_skeleton
 from hand_pose_ros.training import experiments
 from hand_pose_ros.training.augmentation import PRESETS, Augmentation, augment
@@ -776,6 +777,10 @@ def test_the_second_look_learns_behind_a_first_which_stays(folder, tmp_path):
     mean = network.second.head.reconstruction.bias.detach().view(16, 3)
     assert mean[:, :2].mean(0).abs().max() < 0.02
     assert mean[list(network.knuckles), 1].mean() < mean[0, 1] - 0.05
+    # The bones of these joints begin at the palm: hands are shown as if all had the usual size.
+    batch = augment(run.shards.read(0), Augmentation(), torch.arange(4), seed=0)
+    apart, seen = (torch.cdist(poses, poses) for poses in (batch['joints'], run.objective.poses(batch)))
+    torch.testing.assert_close(seen * ZOOM, apart, atol=1e-4, rtol=1e-4)
     run.train()
     last = tmp_path / 'run' / 'last.safetensors'
     trained, kept = load_checkpoint(last).network.state_dict(), load_checkpoint(small).network.state_dict()

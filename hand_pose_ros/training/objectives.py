@@ -72,7 +72,7 @@ class DenseObjective(PoseObjective):
 
     def __init__(self, network: nn.Module, recipe: Recipe, skeleton: Skeleton) -> None:
         super().__init__(network, recipe, skeleton)
-        self.middle_finger = list(skeleton.middle_finger)
+        self.middle_finger = list(skeleton.middle_finger) if skeleton.has_wrist else None
 
     def forward(self, batch: Batch) -> Terms:
         out = self.network.forward_full(batch['patch'])  # type: ignore[operator]
@@ -104,7 +104,9 @@ class DenseObjective(PoseObjective):
                 **{name: _WEIGHTS[name] * value.mean() for name, value in extra.items()}}
 
     def _size(self, batch: Batch) -> Tensor:
-        """The logarithm (B,) of the hands' length over the usual one of their cubes."""
+        """The logarithm (B,) of the hands' length over the usual one of their cubes; 0 where joints do not tell it."""
+        if self.middle_finger is None:
+            return torch.zeros_like(batch['cube_side'])
         cube = batch['cube_center'], batch['cube_side']
         bones = chosen(joints_in_metres(batch['joints'], *cube), self.middle_finger).diff(dim=1).norm(dim=-1)
         return torch.log((bones.sum(1) / batch['cube_side']).clamp(min=0.01) / TOLD_SIZE)

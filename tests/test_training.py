@@ -646,8 +646,10 @@ def test_a_refiner_learns_from_what_its_base_has_not_seen(folder, tmp_path):
         tiny(folder, 'refiner=deep', f'base={base}', out=tmp_path / 'never')
     with pytest.raises(TrainingError, match=r'gives joints of hand21, but icvl has those of icvl16'):
         tiny(folder, 'refiner=or_ref', 'base=deep_prior', out=tmp_path / 'never')
+    with pytest.raises(HandPoseError, match='does not take width'):
+        tiny(folder, 'refiner=or_ref', f'base={base}', 'options.width=8', out=tmp_path / 'never')
     run = tiny(folder, 'refiner=or_ref', f'base={base}', 'optimizer=adamw', 'learning_rate=0.001', 'samples=160',
-               out=tmp_path / 'refined')
+               'options.dropout=0.2', out=tmp_path / 'refined')
     assert list(run.stream.window(0)) == [2, 3]
     other = tiny(folder, 'refiner=or_ref', f'base={base}', 'shard_size=3', out=tmp_path / 'never')
     assert list(other.stream.window(0)) == [3, 4, 5]  # of 16 samples, of which the base has seen 8
@@ -657,6 +659,7 @@ def test_a_refiner_learns_from_what_its_base_has_not_seen(folder, tmp_path):
     run.train()
     assert 'or_ref on icvl-train' in (tmp_path / 'refined' / 'log.txt').read_text()
     refined, before = load_checkpoint(tmp_path / 'refined' / 'last.safetensors'), load_checkpoint(base)
+    assert refined.refiner.config['dropout'] == 0.2
     kept = refined.network.state_dict()
     assert all(torch.equal(kept[key], value) for key, value in before.network.state_dict().items())
     batch = run.shards.read(3)

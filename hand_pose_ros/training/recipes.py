@@ -26,7 +26,8 @@ class Recipe:
     network: str = 'deep'
     """A name of `hand_pose_ros.models.ARCHITECTURES`."""
     options: dict[str, Any] = field(default_factory=lambda: {'bottleneck': 30})
-    """What the network takes, for example options.bottleneck=8, options.bottleneck=none (direct), options.width=48."""
+    """What the network takes, for example options.bottleneck=8, options.bottleneck=none (direct), options.width=48; or
+    what the refiner takes, for example options.dropout=0."""
     train_prior: bool = True
     """Train the reconstruction layer on after it was set to the principal components."""
     refiner: str | None = None

@@ -84,7 +84,9 @@ def _refiner_objective(recipe: Recipe, base: Checkpoint | None, skeleton: Skelet
         raise TrainingError('a refiner needs the checkpoint that it corrects: --set base=FILE')
     if recipe.refiner not in REFINERS:
         raise TrainingError(f'--set refiner={recipe.refiner}: choose one of {", ".join(REFINERS)}')
-    return RefinerObjective(build(recipe.refiner, joints=len(skeleton)), base.network, recipe, skeleton)
+    options = {name: value for name, value in recipe.options.items() if name != 'bottleneck'}  # which no refiner has
+    refiner = build(recipe.refiner, **options | {'joints': len(skeleton)})
+    return RefinerObjective(refiner, base.network, recipe, skeleton)
 
 
 def _make_network(recipe: Recipe, base: Checkpoint | None, skeleton: Skeleton) -> nn.Module:

@@ -158,6 +158,21 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return copy
 
 
+@pytest.mark.skipif(None in map(shutil.which, ('make', 'c++')), reason='make needs a C++ compiler')
+def test_make_completes_an_environment_that_lacks_pip(tmp_path: Path) -> None:
+    """As `python3 -m venv` leaves it where it was interrupted, or where Debian's python3-venv is not installed."""
+    for name in ('Makefile', 'pyproject.toml', 'setup.py', 'CMakeLists.txt', 'package.xml'):
+        shutil.copy(CHECKOUT / name, tmp_path)
+    whole, lacking = tmp_path / 'whole', tmp_path / '.venv/bin/python'
+    whole.write_text('#!/bin/sh\nif [ "$2" = venv ]; then cp whole "$3/bin/python"; fi\n')
+    lacking.parent.mkdir(parents=True)
+    lacking.write_text('#!/bin/sh\necho No module named pip; exit 1\n')
+    for program in (whole, lacking):
+        program.chmod(0o755)
+    run('make', 'setup', f'PYTHON={whole}', cwd=tmp_path)
+    assert 'Nothing to be done' in run('make', 'setup', f'PYTHON={whole}', cwd=tmp_path, LC_ALL='C')
+
+
 def build_wheel(source: Path, out: Path, **environment: str) -> Path:
     run(sys.executable, '-m', 'pip', 'wheel', '-q', '--no-deps', '--no-build-isolation', '-w', out, source, cwd=out,
         **environment)

@@ -3,6 +3,7 @@
 import csv
 import re
 import runpy
+import shlex
 import signal
 import subprocess
 import sys
@@ -107,11 +108,11 @@ def test_bag_without_ros(run: Callable[..., str], film: Film) -> None:
 
 @pytest.mark.parametrize('command', [
     'depth_png.py missing.png --intrinsics 140 140 80 60',
-    f'depth_png.py {CHECKOUT}/demo/depth.png --intrinsics 364.5 364.5 256 208 --picture missing',
+    f'depth_png.py "{CHECKOUT}/demo/depth.png" --intrinsics 364.5 364.5 256 208 --picture missing',
     'bag_without_ros.py missing.mcap',
     'train_on_your_bags.py --train missing.mcap --val missing.mcap --out mine'])
 def test_bad_input_is_one_sentence(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    name, *arguments = command.split()
+    name, *arguments = shlex.split(command)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, 'argv', [name, *arguments])
     with pytest.raises(SystemExit, match=r'missing(\.\w+)?: '):

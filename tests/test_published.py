@@ -2,6 +2,9 @@
 
 import gzip
 import json
+import os
+import subprocess
+import sys
 from contextlib import suppress
 
 import cv2
@@ -105,6 +108,16 @@ def test_nan_and_zero_joints_are_missing(tmp_path, uvd):
     assert (summary['missed_frames'], summary['missed_joints'], summary['frames']) == (1, 16, 5)
     assert summary['mean_mm'] == pytest.approx(0, abs=1e-6), 'what was predicted is right'
     assert summary['within_mm']['80'] == pytest.approx(2 / 5) and summary['detection_rate'] == pytest.approx(4 / 5)
+
+
+def test_the_table_can_be_written_where_there_are_no_signs_but_ascii(tmp_path, uvd):
+    for name in ('p.txt', 'g.txt'):
+        write_uvd(tmp_path / name, uvd)
+    done = subprocess.run([sys.executable, '-m', 'hand_pose_ros.cli', 'evaluate', '--predictions', tmp_path / 'p.txt',
+                           '--ground-truth', tmp_path / 'g.txt', '--dataset', 'nyu'],
+                          env=os.environ | {'PYTHONIOENCODING': 'ascii'}, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert '<=20' in done.stdout
 
 
 def test_names_on_both_sides_decide_what_belongs_together(tmp_path, uvd):

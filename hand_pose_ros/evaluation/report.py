@@ -36,7 +36,7 @@ _CLOUD_POINTS = 2500
 _DEFINITIONS = (
     ('mean, median, max', 'Euclidean distance of single joints in the camera frame, without alignment, over all '
      'joints that were predicted.'),
-    ('≤ d', 'Share of frames whose worst joint is within d mm. A missed joint or frame is a failure at every d.'),
+    ('<= d', 'Share of frames whose worst joint is within d mm. A missed joint or frame is a failure at every d.'),
     ('AUC', 'Area under this curve from 0 to 80 mm, divided by 80.'),
     ('translation, rigid', 'Mean error after each frame was moved, or moved and turned, onto the truth: what is '
      'left is the error of the pose.'),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-ACCURACY_COLUMNS = ('frames', 'missed', 'mean', 'median', 'max', '≤20', '≤30', '≤40', '≤50', '≤80 mm', 'AUC',
+ACCURACY_COLUMNS = ('frames', 'missed', 'mean', 'median', 'max', '<=20', '<=30', '<=40', '<=50', '<=80 mm', 'AUC',
                     'translation', 'rigid', 'jitter', 'bone drift')
 
 

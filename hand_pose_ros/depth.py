@@ -103,7 +103,7 @@ def encode_compressed(
         codec: 'png' (smaller) or 'rvl' (faster to decode in C++ players).
 
     Raises:
-        InputError: another codec.
+        InputError: another codec, or a depth_scale that is none.
     """
     if codec not in ('png', 'rvl'):
         raise InputError(f"unknown codec '{codec}': choose png or rvl")
@@ -146,13 +146,13 @@ def depth_problem(depth: NDArray[np.float32], near: float, far: float, scale_is_
 
 def to_metres(units: NDArray[np.uint16], depth_scale: float = 0.001) -> NDArray[np.float32]:
     """Sensor units (H, W) -> metres, float32; `depth_scale` is in metres per unit."""
-    if not 0 < depth_scale < np.inf:
-        raise InputError(f'depth_scale is {depth_scale}: give the metres per unit (0.001 for millimetres)')
+    _check_scale(depth_scale)
     return np.multiply(units, np.float32(depth_scale), dtype=np.float32)
 
 
 def to_units(depth: NDArray[np.float32], depth_scale: float = 0.001) -> NDArray[np.uint16]:
     """Metres (H, W) -> the nearest sensor unit; what does not fit into 16 bits becomes 0, "no reading"."""
+    _check_scale(depth_scale)
     units = np.rint(np.asarray(depth, np.float64) / depth_scale)
     return np.where((units > 0) & (units <= 0xFFFF), units, 0).astype(np.uint16)
 
@@ -263,6 +263,11 @@ def _decode_png(data: memoryview) -> NDArray[np.uint16]:
     if units is None or units.dtype != np.uint16 or units.shape != (height, width):
         raise InputError(f'the PNG of {width}x{height} pixels is damaged: record or copy it again')
     return np.asarray(units, np.uint16)
+
+
+def _check_scale(depth_scale: float) -> None:
+    if not 0 < depth_scale < np.inf:
+        raise InputError(f'depth_scale is {depth_scale}: give the metres per unit (0.001 for millimetres)')
 
 
 def _check_size(width: int, height: int) -> None:

@@ -102,6 +102,8 @@ def test_a_bad_image_is_refused_in_one_sentence_that_begins_with_its_topic(units
 def test_a_depth_scale_that_is_none_is_refused(units, scale):
     with pytest.raises(InputError, match='depth_scale'):
         decode_image(image(units), scale)
+    with pytest.raises(InputError, match='depth_scale'):
+        encode_compressed(units * np.float32(0.001), depth_scale=scale)
 
 
 @pytest.mark.parametrize('form', [

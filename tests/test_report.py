@@ -9,6 +9,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from matplotlib.legend import Legend
 
 from hand_pose_ros.cli import main
 from hand_pose_ros.evaluation import metrics, plots
@@ -121,6 +122,17 @@ def test_curves_show_what_the_metrics_say(result):
         assert line.get_ydata() == pytest.approx(100 * curve(result.errors_mm, line.get_xdata()))
     bars = [bar.get_height() for bar in plots.joint_bars([result]).axes[0].patches]
     assert bars == pytest.approx(metrics.per_joint_mm(result.errors_mm))
+
+
+def test_any_name_of_a_result_can_be_drawn(result, tmp_path):
+    odd = [replace(result, name=name) for name in ('costs $1_{ to $2', '100 %')]
+    write_report(odd, tmp_path)
+    assert 'costs $1_{ to $2' in legends(plots.curves(odd))[0]
+
+
+def legends(figure):
+    """What the legends of a figure say, entry by entry."""
+    return [text.get_text() for legend in figure.findobj(Legend) for text in legend.get_texts()]
 
 
 @pytest.fixture(scope='session')

@@ -26,6 +26,7 @@ STYLE: dict[Any, Any] = {
     'grid.color': '#e4e7eb', 'grid.linewidth': 0.8, 'axes.axisbelow': True, 'axes.edgecolor': '#8a94a0',
     'xtick.color': '#4a5560', 'ytick.color': '#4a5560', 'axes.labelcolor': '#2a3138', 'legend.frameon': False,
     'svg.hashsalt': 'hand_pose_ros',  # the same figure gives the same file
+    'text.parse_math': False,  # names of files may hold $
 }
 
 

@@ -125,9 +125,10 @@ def test_curves_show_what_the_metrics_say(result):
 
 
 def test_any_name_of_a_result_can_be_drawn(result, tmp_path):
-    odd = [replace(result, name=name) for name in ('costs $1_{ to $2', '100 %')]
+    odd = [replace(result, name=name) for name in ('costs $1_{ to $2', '100 %', '_old')]
     write_report(odd, tmp_path)
-    assert 'costs $1_{ to $2' in legends(plots.curves(odd))[0]
+    for figure in plots.curves(odd), plots.joint_bars(odd):
+        assert all(any(one.name in entry for entry in legends(figure)) for one in odd)
 
 
 def legends(figure):

@@ -38,9 +38,9 @@ def curves(results: Sequence[Result]) -> Figure:
     for result, color in _colored(results):
         errors, wide = result.errors_mm, 2.4 if result is results[0] else 1.6
         left.plot(distances, 100 * metrics.success_curve(errors, distances), color=color, lw=wide,
-                  label=f'{result.name}   AUC {metrics.auc(errors):.3f}')
+                  label=f'{_entry(result)}   AUC {metrics.auc(errors):.3f}')
         right.plot(distances, 100 * metrics.pck(errors, distances), color=color, lw=wide,
-                   label=f'{result.name}   mean {metrics.mean_mm(errors):.1f} mm')
+                   label=f'{_entry(result)}   mean {metrics.mean_mm(errors):.1f} mm')
     left.set(title='Frames with all joints within', ylabel='frames, %')
     right.set(title='Joints within', ylabel='joints, %')
     for axes in (left, right):
@@ -58,7 +58,7 @@ def joint_bars(results: Sequence[Result]) -> Figure:
     for k, (result, color) in enumerate(_colored(results)):
         means = metrics.per_joint_mm(result.errors_mm)
         axes.bar(np.arange(len(skeleton)) + (k + 0.5) * width - 0.4, means, width * 0.92, color=color,
-                 label=result.name)
+                 label=_entry(result))
     axes.set_xticks(range(len(skeleton)), [name.replace('_', ' ') for name in skeleton.joint_names],
                     rotation=45, ha='right', rotation_mode='anchor')
     axes.set(title='Error of each joint', ylabel='mean error, mm', xlim=(-0.6, len(skeleton) - 0.4))
@@ -128,6 +128,11 @@ def _figure(width: float, height: float, columns: int = 1) -> tuple[Figure, NDAr
 
 def _colored(results: Sequence[Result]) -> list[tuple[Result, str]]:
     return [(result, COLORS[k % len(COLORS)]) for k, result in enumerate(results)]
+
+
+def _entry(result: Result) -> str:
+    """The name of a result in a legend, which leaves out what begins with _."""
+    return f' {result.name}'
 
 
 def _time_axis(result: Result) -> tuple[NDArray[np.float64], str]:

@@ -131,6 +131,21 @@ def test_any_name_of_a_result_can_be_drawn(result, tmp_path):
         assert all(any(one.name in entry for entry in legends(figure)) for one in odd)
 
 
+def test_many_results_with_long_names_can_be_told_apart(result):
+    many = [replace(result, name=f'{k} of {"many " * 40}') for k in range(20)]
+    for figure in plots.curves(many), plots.joint_bars(many):
+        figure.draw_without_rendering()
+        (legend,) = figure.findobj(Legend)
+        inside = legend.get_window_extent()
+        assert figure.bbox.containsx(inside.x0) and figure.bbox.containsx(inside.x1)
+        assert figure.bbox.containsy(inside.y0) and figure.bbox.containsy(inside.y1)
+        for axes in figure.axes:
+            around = axes.get_tightbbox()
+            assert not around.overlaps(inside) and around.height > figure.bbox.height / 5, 'no curve is covered'
+    lines = plots.curves(many).axes[0].lines
+    assert len({(line.get_color(), line.get_linestyle()) for line in lines}) == 20
+
+
 def legends(figure):
     """What the legends of a figure say, entry by entry."""
     return [text.get_text() for legend in figure.findobj(Legend) for text in legend.get_texts()]

@@ -19,6 +19,12 @@ from hand_pose_ros.files import write_bytes
 
 # Okabe & Ito (2008): told apart with any colour vision, and in grey by their order of lightness.
 COLORS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9', '#000000', '#B8A800')
+LINES = ('-', '--', ':', '-.')
+"""Of curves that must share a color."""
+LINE_INCHES = 0.19
+"""Height of an entry of a legend."""
+LONGEST = 80
+"""Letters of a name that a legend has room for."""
 
 STYLE: dict[Any, Any] = {
     'font.family': 'DejaVu Sans', 'font.size': 10, 'axes.titlesize': 11, 'axes.titleweight': 'bold',
@@ -34,18 +40,18 @@ STYLE: dict[Any, Any] = {
 def curves(results: Sequence[Result]) -> Figure:
     """Fraction of frames whose every joint, and of joints that themselves, are within a distance."""
     distances = np.linspace(0, 80, 321)
-    figure, (left, right) = _figure(10.5, 4.3, 2)
-    for result, color in _colored(results):
-        errors, wide = result.errors_mm, 2.4 if result is results[0] else 1.6
-        left.plot(distances, 100 * metrics.success_curve(errors, distances), color=color, lw=wide,
-                  label=f'{_entry(result)}   AUC {metrics.auc(errors):.3f}')
-        right.plot(distances, 100 * metrics.pck(errors, distances), color=color, lw=wide,
-                   label=f'{_entry(result)}   mean {metrics.mean_mm(errors):.1f} mm')
+    figure, (left, right) = _figure(10.5, 4.1 + LINE_INCHES * len(results), 2)
+    for k, (result, color) in enumerate(_colored(results)):
+        errors = result.errors_mm
+        style = {'color': color, 'lw': 1.6 if k else 2.4, 'ls': LINES[k // len(COLORS) % len(LINES)]}
+        left.plot(distances, 100 * metrics.success_curve(errors, distances), **style,
+                  label=f'{_entry(result)}   AUC {metrics.auc(errors):.3f}, mean {metrics.mean_mm(errors):.1f} mm')
+        right.plot(distances, 100 * metrics.pck(errors, distances), **style)
     left.set(title='Frames with all joints within', ylabel='frames, %')
     right.set(title='Joints within', ylabel='joints, %')
     for axes in (left, right):
         axes.set(xlim=(0, 80), ylim=(0, 100), xlabel='distance, mm')
-        axes.legend(loc='best', fontsize=9)  # where it covers least
+    figure.legend(loc='outside lower left', fontsize=9)  # where it covers nothing, however many they are
     return figure
 
 
@@ -53,7 +59,8 @@ def curves(results: Sequence[Result]) -> Figure:
 def joint_bars(results: Sequence[Result]) -> Figure:
     """Mean error of each joint, results side by side; they must have the same skeleton."""
     skeleton = results[0].skeleton
-    figure, (axes,) = _figure(max(7.0, 0.5 * len(skeleton) + 2), 4)
+    rows = len(results) if len(results) > 1 else 0
+    figure, (axes,) = _figure(max(7.0, 0.5 * len(skeleton) + 2), 4 + LINE_INCHES * rows)
     width = 0.8 / len(results)
     for k, (result, color) in enumerate(_colored(results)):
         means = metrics.per_joint_mm(result.errors_mm)
@@ -63,8 +70,8 @@ def joint_bars(results: Sequence[Result]) -> Figure:
                     rotation=45, ha='right', rotation_mode='anchor')
     axes.set(title='Error of each joint', ylabel='mean error, mm', xlim=(-0.6, len(skeleton) - 0.4))
     axes.grid(axis='x', visible=False)
-    if len(results) > 1:
-        axes.legend(fontsize=9, ncols=min(4, len(results)), loc='lower right', bbox_to_anchor=(1, 1))
+    if rows:
+        figure.legend(loc='outside lower left', fontsize=9)
     return figure
 
 
@@ -131,8 +138,9 @@ def _colored(results: Sequence[Result]) -> list[tuple[Result, str]]:
 
 
 def _entry(result: Result) -> str:
-    """The name of a result in a legend, which leaves out what begins with _."""
-    return f' {result.name}'
+    """The name of a result in a legend, which leaves out what begins with _; a long one without its middle."""
+    name, half = result.name, LONGEST // 2
+    return f' {name}' if len(name) <= LONGEST else f' {name[:half]} … {name[-half:]}'
 
 
 def _time_axis(result: Result) -> tuple[NDArray[np.float64], str]:

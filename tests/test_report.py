@@ -112,7 +112,9 @@ def test_bones_of_two_subjects_are_not_one_hand_that_changes(result):
 
 def test_report_of_nothing_found_can_be_written(result, tmp_path):
     nothing = Result('n', HAND21, CAMERA, np.full((3, 21, 3), np.nan), result.truth[:3])
-    assert '<canvas data-view' not in write_report([nothing], tmp_path).read_text()
+    page = write_report([nothing], tmp_path).read_text()
+    assert '<canvas data-view' not in page and '<td>nan</td>' not in page
+    assert legends(plots.curves([nothing])) == [' n   AUC 0.000, mean -']
 
 
 def test_curves_show_what_the_metrics_say(result):

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from hand_pose_ros.evaluation import metrics
 from hand_pose_ros.evaluation.results import Result
+from hand_pose_ros.evaluation.tables import number
 from hand_pose_ros.files import write_bytes
 
 # Okabe & Ito (2008): told apart with any colour vision, and in grey by their order of lightness.
@@ -45,7 +46,8 @@ def curves(results: Sequence[Result]) -> Figure:
         errors = result.errors_mm
         style = {'color': color, 'lw': 1.6 if k else 2.4, 'ls': LINES[k // len(COLORS) % len(LINES)]}
         left.plot(distances, 100 * metrics.success_curve(errors, distances), **style,
-                  label=f'{_entry(result)}   AUC {metrics.auc(errors):.3f}, mean {metrics.mean_mm(errors):.1f} mm')
+                  label=f'{_entry(result)}   AUC {number(metrics.auc(errors), 3)}, '
+                        f'mean {number(metrics.mean_mm(errors), 1, " mm")}')
         right.plot(distances, 100 * metrics.pck(errors, distances), **style)
     left.set(title='Frames with all joints within', ylabel='frames, %')
     right.set(title='Joints within', ylabel='joints, %')

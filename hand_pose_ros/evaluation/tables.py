@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import isnan
 from typing import Any
 
 ACCURACY_COLUMNS = ('frames', 'missed', 'mean', 'median', 'max', '<=20', '<=30', '<=40', '<=50', '<=80 mm', 'AUC',
@@ -28,8 +29,8 @@ def _accuracy_cells(summary: dict[str, Any]) -> tuple[str, ...]:
 
 
 def number(value: float | None, digits: int, unit: str = '', factor: float = 1) -> str:
-    """A number with so many digits behind the point, or '-' for None."""
-    return '-' if value is None else f'{factor * value:.{digits}f}{unit}'
+    """A number with so many digits behind the point, or '-' for None and NaN."""
+    return '-' if value is None or isnan(value) else f'{factor * value:.{digits}f}{unit}'
 
 
 def text_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

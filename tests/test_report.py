@@ -126,6 +126,16 @@ def test_curves_show_what_the_metrics_say(result):
     assert bars == pytest.approx(metrics.per_joint_mm(result.errors_mm))
 
 
+@pytest.mark.parametrize('frames', [200, 2000])
+def test_errors_over_time_show_labels_of_some_images_only(result, frames):
+    rows = np.arange(frames) * 40 // frames
+    truth = np.where((np.arange(frames) % 10 == 0)[:, None, None], result.truth[rows], np.nan)
+    some = replace(result, predictions=result.predictions[rows], truth=truth, stamps_ns=33_000_000 * np.arange(frames))
+    image = cv2.imdecode(np.frombuffer(plots.to_bytes(plots.over_time(some), 'png'), np.uint8), 1)
+    plot = image[image.shape[0] // 4:]  # without the legend
+    assert (np.abs(plot.astype(int) - [178, 114, 0]).max(-1) < 40).sum() > 100
+
+
 def test_any_name_of_a_result_can_be_drawn(result, tmp_path):
     odd = [replace(result, name=name) for name in ('costs $1_{ to $2', '100 %', '_old')]
     write_report(odd, tmp_path)

@@ -156,10 +156,11 @@ def _band(axes: Axes, at: NDArray[np.float64], values: NDArray[np.float64], colo
     values = np.where(np.isfinite(values), values, np.nan)
     group = -(-len(values) // 800)
     if group == 1:
-        axes.plot(at, values, color=color, lw=1.2, label=label)
+        axes.plot(at, values, '.-', color=color, lw=1.2, ms=3, label=label)  # dots: neighbours may lack
         return
     cut = len(values) // group * group
     grouped = np.ma.masked_invalid(values[:cut].reshape(-1, group))
     middle = at[:cut].reshape(-1, group).mean(1)
     axes.fill_between(middle, grouped.min(1), grouped.max(1), color=color, alpha=0.25, lw=0)
-    axes.plot(middle, np.ma.median(grouped, axis=1), color=color, lw=1, label=f'{label} (median, range of {group})')
+    axes.plot(middle, np.ma.median(grouped, axis=1), '.-', color=color, lw=1, ms=2,
+              label=f'{label} (median, range of {group})')

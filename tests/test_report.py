@@ -126,6 +126,11 @@ def test_curves_show_what_the_metrics_say(result):
     assert bars == pytest.approx(metrics.per_joint_mm(result.errors_mm))
 
 
+def test_labels_scored_as_predictions_are_drawn_at_zero(result):
+    (axes,) = plots.over_time(replace(result, predictions=result.truth)).axes
+    assert axes.get_ylim()[0] == 0
+
+
 @pytest.mark.parametrize('frames', [200, 2000])
 def test_errors_over_time_show_labels_of_some_images_only(result, frames):
     rows = np.arange(frames) * 40 // frames

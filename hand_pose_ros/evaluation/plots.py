@@ -87,7 +87,7 @@ def over_time(result: Result) -> Figure:
     _band(axes, at, worst, COLORS[5], 'worst joint')
     _band(axes, at, means, COLORS[0], 'mean of joints')
     missed = metrics.missed_frames(errors)
-    top = np.nanpercentile(worst[np.isfinite(worst)], 99.8) * 1.05 if np.isfinite(worst).any() else 1
+    top = np.nanpercentile(worst[np.isfinite(worst)], 99.8) * 1.05 if np.isfinite(worst).any() else 0
     if missed.any():
         axes.plot(at[missed], np.full(missed.sum(), 0.01 * top), '|', color=COLORS[1], ms=9, clip_on=False,
                   label='missed')
@@ -95,7 +95,7 @@ def over_time(result: Result) -> Figure:
         axes.axvline(at[start], color='#4a5560', lw=1, ls=':')
         axes.annotate(name, (at[start], 1), xycoords=('data', 'axes fraction'), xytext=(4, -2), fontsize=9,
                       textcoords='offset points', va='top', color='#4a5560')
-    axes.set(title='Error over time', xlabel=label, ylabel='error, mm', ylim=(0, top),
+    axes.set(title='Error over time', xlabel=label, ylabel='error, mm', ylim=(0, top or 1),
              xlim=(at[0], at[-1]) if at[-1] > at[0] else None)
     axes.legend(fontsize=9, ncols=3, loc='lower right', bbox_to_anchor=(1, 1))
     return figure

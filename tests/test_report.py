@@ -131,6 +131,20 @@ def test_labels_scored_as_predictions_are_drawn_at_zero(result):
     assert axes.get_ylim()[0] == 0
 
 
+@pytest.mark.parametrize('stamps', [np.zeros(40, int), np.arange(40) % 20], ids=['all 0', 'of a loop'])
+def test_images_without_a_time_of_their_own_are_drawn_in_order(result, stamps):
+    odd = replace(result, stamps_ns=stamps)
+    for axes in plots.over_time(odd).axes + plots.latency(odd).axes:
+        assert axes.get_xlim() == (1, 40) and axes.get_xlabel() == 'frame'
+
+
+def test_the_time_of_a_single_image_is_drawn(result):
+    one = replace(result, predictions=result.predictions[:1], truth=result.truth[:1], stamps_ns=result.stamps_ns[:1],
+                  seconds={stage: seconds[:1] for stage, seconds in result.seconds.items()})
+    image = cv2.imdecode(np.frombuffer(plots.to_bytes(plots.latency(one), 'png'), np.uint8), 1)
+    assert (np.abs(image.astype(int) - [178, 114, 0]).max(-1) < 40).mean() > 0.4
+
+
 @pytest.mark.parametrize('frames', [200, 2000])
 def test_errors_over_time_show_labels_of_some_images_only(result, frames):
     rows = np.arange(frames) * 40 // frames

@@ -106,10 +106,12 @@ def latency(result: Result) -> Figure:
     """Milliseconds of each stage in each frame, stacked: what a frame costs, and where."""
     at, label = _time_axis(result)
     stages = {stage: 1000 * np.nan_to_num(seconds) for stage, seconds in result.seconds.items() if stage != 'total'}
+    if len(at) == 1:
+        at, stages = np.array([0.5, 1.5]), {stage: ms.repeat(2) for stage, ms in stages.items()}  # a width
     figure, (axes,) = _figure(10.5, 3.2)
     axes.stackplot(at, *stages.values(), labels=list(stages), colors=COLORS, lw=0, step='mid')
     total = np.sum(list(stages.values()), axis=0)
-    axes.set(title='Time of each frame', xlabel=label, ylabel='ms', ylim=(0, np.percentile(total, 99.5) * 1.1),
+    axes.set(title='Time of each frame', xlabel=label, ylabel='ms', ylim=(0, np.percentile(total, 99.5) * 1.1 or 1),
              xlim=(at[0], at[-1]) if at[-1] > at[0] else None)
     axes.legend(fontsize=9, ncols=len(stages), loc='lower right', bbox_to_anchor=(1, 1))
     return figure
@@ -146,7 +148,7 @@ def _entry(result: Result) -> str:
 
 
 def _time_axis(result: Result) -> tuple[NDArray[np.float64], str]:
-    if result.stamps_ns is None:
+    if result.stamps_ns is None or len(result.stamps_ns) < 2 or (np.diff(result.stamps_ns) <= 0).any():
         return np.arange(1.0, len(result.predictions) + 1), 'frame'
     return (result.stamps_ns - result.stamps_ns[0]) / 1e9, 'time, s'
 
@@ -156,7 +158,7 @@ def _band(axes: Axes, at: NDArray[np.float64], values: NDArray[np.float64], colo
     values = np.where(np.isfinite(values), values, np.nan)
     group = -(-len(values) // 800)
     if group == 1:
-        axes.plot(at, values, '.-', color=color, lw=1.2, ms=3, label=label)  # dots: neighbours may lack
+        axes.plot(at, values, '.-', color=color, lw=1.2, ms=3, label=label)  # dots show single frames
         return
     cut = len(values) // group * group
     grouped = np.ma.masked_invalid(values[:cut].reshape(-1, group))

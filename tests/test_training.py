@@ -317,7 +317,10 @@ def test_any_value_of_a_recipe_can_be_replaced():
     ('knee=0', 'at least 1e-06'), ('weight_decay=-1', 'at least 0'), ('warmup=2', 'at most 1'),
     ('augmentation.scale=0', r'--set augmentation\.scale=0: must be at least 1'),
     ('augmentation.dropout=2', 'at most 1'), ('augmentation.jitter=8', r'at most 0\.1'),
-    ('augmentation=strong', 'choose one of'), ('augmentation.strong=1', "no 'strong'"), ('seed.x=1', 'is one value')])
+    ('augmentation=strong', 'choose one of'), ('augmentation.strong=1', "no 'strong'"), ('seed.x=1', 'is one value'),
+    ('options.bottleneck.x=8', 'is one value'), ('loss=l1', "unknown loss 'l1': choose huber, smooth_l1 or squared"),
+    ('optimizer=adam', "unknown optimizer 'adam'"), ('schedule=step', "unknown schedule 'step'"),
+    ('precision=float16', "unknown precision 'float16': choose float32 or bfloat16")])
 def test_a_wrong_override_is_one_sentence(override, message):
     with pytest.raises(HandPoseError, match=message):
         get_recipe('paper', [override])

@@ -82,8 +82,6 @@ class Run:
         self.rank, self.world = int(os.environ.get('RANK', 0)), int(os.environ.get('WORLD_SIZE', 1))
         if recipe.batch_size % self.world:
             raise TrainingError(f'a batch of {recipe.batch_size} cannot be shared equally by {self.world} processes')
-        if recipe.precision not in ('float32', 'bfloat16'):
-            raise TrainingError(f"unknown precision '{recipe.precision}': choose float32 or bfloat16")
         keep_freed_memory()
         torch.backends.cudnn.benchmark = True  # all steps have the same shapes
         if machine.threads:

@@ -20,7 +20,11 @@ MAX_SEED = 1 << 22
 
 @dataclass(frozen=True)
 class Recipe:
-    """All that decides the result of a training run; the machine (device, processes, folders) does not."""
+    """All that decides the result of a training run; the machine (device, processes, folders) does not.
+
+    Raises:
+        HandPoseError: there is no such loss, optimiser, schedule or precision.
+    """
 
     # Network
     network: str = 'deep'
@@ -83,7 +87,16 @@ class Recipe:
     """Samples between two validations."""
 
 
+    def __post_init__(self) -> None:
+        for name, choices in _CHOICES.items():
+            if (value := getattr(self, name)) not in choices:
+                raise HandPoseError(f"unknown {name} '{value}': choose {', '.join(choices[:-1])} or {choices[-1]}")
+
+
 EPOCH_OF_ENDLESS_DATA = 72_757
+
+_CHOICES = {'loss': ('huber', 'smooth_l1', 'squared'), 'optimizer': ('sgd', 'rmsprop', 'adamw', 'muon'),
+            'schedule': ('constant', 'hyperbolic', 'cosine'), 'precision': ('float32', 'bfloat16')}
 
 _RANGES: dict[str, tuple[float, float]] = {
     'knee': (1e-6, math.inf), 'learning_rate': (1e-9, math.inf), 'seed': (0, MAX_SEED - 1), 'rotation_deg': (0, 180),
@@ -161,7 +174,7 @@ def _replace(target: T, keys: list[str], text: str, item: str) -> T:
         raise HandPoseError(f"--set {item}: there is no '{key}'; choose one of {', '.join(fields)}")
     if len(keys) > 1:
         inner = getattr(target, key)
-        if isinstance(inner, dict):
+        if isinstance(inner, dict) and len(keys) == 2:
             value: Any = {**inner, keys[1]: _literal(text)}
         elif dataclasses.is_dataclass(inner):
             value = _replace(inner, keys[1:], text, item)

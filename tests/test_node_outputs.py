@@ -302,6 +302,21 @@ def test_what_is_live_is_shown_with_a_camera_info_that_was_published_once_before
     assert cameras[0].fx == FOCAL
 
 
+def test_what_is_live_is_shown_with_intrinsics_that_are_given():
+    rclpy.init()
+    try:
+        cameras, said = [], []
+        for given in (None, (500.0, 501.0, 80.0, 60.0)):
+            watcher = _Watcher(lambda _, __, camera: cameras.append(camera), lambda *_: None, 'raw', 0.001, given)
+            watcher._complain = said.append
+            watcher._image(image(depth_with_hand()))
+            watcher._node.destroy_node()
+    finally:
+        rclpy.try_shutdown()
+    assert [(camera.fx, camera.fy, camera.cx, camera.cy) for camera in cameras] == [given]
+    assert len(said) == 1 and 'no camera_info arrived' in said[0] and 'give --intrinsics' in said[0]
+
+
 def test_hands_that_do_not_fit_are_not_shown_live():
     rclpy.init()
     try:

@@ -20,6 +20,7 @@ from hand_pose_ros.cli.arguments import (
     add_bag,
     add_estimator,
     bag_options,
+    check_intrinsics,
     count,
     estimator_options,
     keep_input,
@@ -51,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('bag', metavar='BAG', type=Path, nargs='?', help='a .bag, .mcap or .db3 file, or a ROS 2 '
                         'folder: its hands are estimated; without it, live topics are shown')
     parser.add_argument('--save', metavar='FILE', type=Path, help='write an .rrd file instead of opening the viewer')
-    bag = parser.add_argument_group('with a bag (live, --depth-scale alone)')
+    bag = parser.add_argument_group('with a bag (live, --intrinsics and --depth-scale alone)')
     add_bag(bag)
     add_estimator(bag)
     bag.add_argument('--max-hands', type=count, default=2, metavar='N', help='at most N hands per image (2)')
@@ -70,11 +71,13 @@ def run(args: argparse.Namespace) -> int:
     if args.bag is not None:
         refuse(args, ('transport', 'ros_args'), 'is for live topics')
         return _view_bag(args)
-    refuse(args, (*(name for name in BAG if name != 'depth_scale'), *ESTIMATOR, 'max_hands'),
+    refuse(args, (*(name for name in BAG if name not in ('intrinsics', 'depth_scale')), *ESTIMATOR, 'max_hands'),
            'is for bags: which live topics are shown is said by --ros-args -r from:=to')
+    check_intrinsics(args)
     from hand_pose_ros.ros.watch import watch  # says what is missing where there is no ROS
     with Scene(args.save) as scene:
-        watch(scene.add_depth, scene.add_hands, args.transport, args.depth_scale or 0.001, args.ros_args)
+        watch(scene.add_depth, scene.add_hands, args.transport, args.depth_scale or 0.001, args.intrinsics,
+              args.ros_args)
     return 0
 
 
@@ -117,7 +120,7 @@ class Scene:
             import rerun
             from rerun import blueprint
         except ImportError as error:
-            raise HandPoseError(f"hand-pose view needs Rerun ({error}): in the checkout, pip install '.[view]', or "
+            raise HandPoseError(f"Rerun is needed ({error}): in the checkout, pip install '.[view]', or "
                                 'anywhere pip install rerun-sdk') from error
         if path is None and sys.platform == 'linux' and not {'DISPLAY', 'WAYLAND_DISPLAY'} & os.environ.keys():
             raise HandPoseError('there is no display for the viewer: write a file with --save FILE.rrd and open it '

@@ -20,10 +20,14 @@ class Camera:
 
     Images and camera_info are not synchronised: an exact match of stamps would wait for drivers that publish the info
     once, or late, or with another stamp. The newest one that has the size of the image is taken instead.
+
+    Args:
+        topic: of the camera_info.
+        remedy: what else may be done where there is none.
     """
 
-    def __init__(self, topic: str) -> None:
-        self.topic = topic
+    def __init__(self, topic: str, remedy: str = 'set the parameters intrinsics.fx, .fy, .cx and .cy') -> None:
+        self.topic, self._remedy = topic, remedy
         self._info: CameraInfo | None = None
         self._closed = False
         self._changed = threading.Condition()
@@ -69,7 +73,7 @@ class Camera:
             info = self._info
         if info is None:
             raise InputError(f'no camera_info arrived on {self.topic}: publish it beside the depth image, remap '
-                             'depth/camera_info, or set the parameters intrinsics.fx, .fy, .cx and .cy')
+                             f'depth/camera_info, or {self._remedy}')
         with naming(self.topic):
             intrinsics = Intrinsics.from_camera_info(info, rectified=params.use_rectified)
             intrinsics.check_size(width, height)

@@ -33,16 +33,17 @@ OnHands = Callable[[int, list[HandEstimate], Skeleton], None]
 
 
 def watch(on_depth: OnDepth, on_hands: OnHands, transport: str = 'raw', depth_scale: float = 0.001,
-          ros_args: Sequence[str] = ()) -> None:
+          intrinsics: Sequence[float] | None = None, ros_args: Sequence[str] = ()) -> None:
     """Call back, with stamps in ns, for each depth image and for the hands of each image, until Ctrl-C.
 
     Args:
         transport, depth_scale: as the parameters of the node `estimator`.
+        intrinsics: fx, fy, cx and cy in pixels, instead of those of camera_info.
         ros_args: remappings (`-r from:=to`) and so on.
     """
     ros.init(['--ros-args', *ros_args])
     try:
-        _Watcher(on_depth, on_hands, transport, depth_scale).spin()
+        _Watcher(on_depth, on_hands, transport, depth_scale, intrinsics).spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
@@ -52,14 +53,17 @@ def watch(on_depth: OnDepth, on_hands: OnHands, transport: str = 'raw', depth_sc
 class _Watcher:
     """Node `view`. What cannot be shown is left out with a warning."""
 
-    def __init__(self, on_depth: OnDepth, on_hands: OnHands, transport: str, depth_scale: float) -> None:
+    def __init__(self, on_depth: OnDepth, on_hands: OnHands, transport: str, depth_scale: float,
+                 intrinsics: Sequence[float] | None = None) -> None:
         self._node = rclpy.create_node('view')
         self._on_depth, self._on_hands = on_depth, on_hands
-        self._params = Params(transport=transport, depth_scale=depth_scale, camera_info_timeout=0.0)
+        fx, fy, cx, cy = intrinsics or (0.0, 0.0, 0.0, 0.0)
+        self._params = Params(transport=transport, depth_scale=depth_scale, camera_info_timeout=0.0,
+                              intrinsics_fx=fx, intrinsics_fy=fy, intrinsics_cx=cx, intrinsics_cy=cy)
         self._statistics = Statistics()
         self._frame = ''
         self._topic, info_topic = topics.input_topics(self._node, transport)
-        self._camera = Camera(info_topic)
+        self._camera = Camera(info_topic, 'give --intrinsics FX FY CX CY')
         image_type, self._decode = (Image, decode_image) if transport == 'raw' else (CompressedImage, decode_compressed)
         topics.subscribe(self._node, CameraInfo, info_topic, self._camera.update, self._complain)
         topics.subscribe(self._node, image_type, self._topic, self._image, self._complain)

@@ -107,7 +107,7 @@ class HandPoseEstimator:
         metadata: of the weights, for whoever publishes or writes joints (see `models.checkpoints`).
 
     Raises:
-        InputError: there is no such side or range, or not one hand to look for.
+        InputError: there is no such side or range, a number is out of its range, or not one hand to look for.
     """
 
     engine: Engine
@@ -133,6 +133,10 @@ class HandPoseEstimator:
         if not 0 <= self.near < self.far:
             raise InputError(f'hands are looked for between near and far, which are {self.near} and {self.far} m: near '
                              'must be less, and not negative')
+        if not (0 < self.cube_side < math.inf and 0 <= self.smoothing < math.inf and math.isfinite(self.min_score)):
+            raise InputError(
+                f'cube_side is {self.cube_side}, smoothing {self.smoothing} and min_score {self.min_score}: '
+                'the first must be more than 0, the second not negative, and all finite')
         self._tracks: list[_Track] = []
         self._ids = count(1)
         self._last_s: float | None = None
@@ -196,11 +200,12 @@ class HandPoseEstimator:
         self.timings = dict.fromkeys(('detect', 'crop', 'predict', 'uncrop'), 0.0)
 
         elapsed = 0.0 if time_s is None or self._last_s is None else time_s - self._last_s
-        dt = elapsed if elapsed > 0 else FRAME_S  # two images of one time are of a driver that does not tell it
+        # Two images of one time are of a driver that does not tell it.
+        dt = elapsed if 0 < elapsed < math.inf else FRAME_S
         self._last_s = time_s
 
         hands: list[HandEstimate] = []
-        tracks, self._tracks = self._tracks, []  # whatever goes wrong with one, it is not met again
+        tracks, self._tracks = self._tracks if self.tracking else [], []  # what goes wrong with one is not met again
         for track in tracks:
             usual = self.cube_side == self.metadata.get('cube_side')  # another was chosen with a hand in mind
             cube = Cube(track.center, self.cube_side * (track.scale if usual else 1))
@@ -213,8 +218,6 @@ class HandPoseEstimator:
                 self._tracks.append(track)
                 hands.append(self._follow(track, reading, dt))
         self._find(depth, intrinsics, hands, dt, regions)
-        if not self.tracking:
-            self._tracks.clear()
         return hands
 
     def _find(self, depth: NDArray[np.float32], intrinsics: Intrinsics, hands: list[HandEstimate], dt: float,

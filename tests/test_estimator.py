@@ -98,10 +98,30 @@ def test_smoothing_that_is_switched_on_again_knows_nothing_of_before(sequence):
 
 @pytest.mark.parametrize(('options', 'message'), [
     ({'side': 'Left'}, "unknown side 'Left': choose auto"), ({'max_hands': 0}, 'max_hands is 0'),
-    ({'near': 1.0, 'far': 0.5}, 'which are 1.0 and 0.5 m')])
+    ({'near': 1.0, 'far': 0.5}, 'which are 1.0 and 0.5 m'), ({'cube_side': -0.3}, 'cube_side is -0.3'),
+    ({'smoothing': float('nan')}, 'smoothing nan'), ({'min_score': float('nan')}, 'min_score nan: .* all finite')])
 def test_options_that_find_nothing_are_refused(options, message):
     with pytest.raises(InputError, match=message):
         HandPoseEstimator.from_pretrained(device='cpu', **options)
+
+
+def test_from_the_moment_that_tracking_ends_hands_have_no_history(sequence):
+    estimator = HandPoseEstimator.from_pretrained(device='cpu')
+    first, *others = sequence[:4]
+    names = {hand.id for hand in estimator(first.depth, first.intrinsics)}
+    estimator.tracking = False
+    for frame in others:
+        [hand] = estimator(frame.depth, frame.intrinsics)
+        assert hand.id not in names
+        names.add(hand.id)
+
+
+@pytest.mark.parametrize('time_s', [float('inf'), float('nan'), 1e300, -5.0])
+def test_times_that_are_none_do_not_reach_the_joints(time_s, sequence):
+    estimator = HandPoseEstimator.from_pretrained(device='cpu', smoothing=1.0)
+    for frame, time in zip(sequence[:4], (1.0, time_s, 1.1, 1.2), strict=True):
+        [hand] = estimator(frame.depth, frame.intrinsics, time_s=time)
+        assert np.isfinite(hand.joints).all()
 
 
 @pytest.mark.parametrize('tilt', [0.0, 0.5], ids=['wall', 'table'])

@@ -38,6 +38,7 @@ def shade(depth: NDArray[np.float32], intrinsics: Intrinsics, near: float | None
         depth: what is not finite counts as no reading, as 0 does.
         near, far: metres over which the tint goes from bright to dark; by default the range of the image.
     """
+    depth = np.asarray(depth, np.float32)  # OpenCV filters no other
     valid = (depth > 0) & np.isfinite(depth)
     if not valid.any():
         return np.full((*depth.shape, 3), _NOTHING, np.uint8)
@@ -58,18 +59,26 @@ def shade(depth: NDArray[np.float32], intrinsics: Intrinsics, near: float | None
 
 
 def draw_joints(picture: Picture, joints: ArrayLike, intrinsics: Intrinsics, skeleton: Skeleton = HAND21) -> None:
-    """Draw joints (J, 3) in metres and the bones between them into the picture, coloured per finger."""
+    """Draw joints (J, 3) in metres and the bones between them into the picture, coloured per finger.
+
+    Joints that are not finite or not before the camera are left out.
+    """
     joints = np.asarray(joints, np.float64)
-    pixels = intrinsics.project(joints)
-    radius = 0.0035 * intrinsics.fx / float(np.median(joints[:, 2]))  # 3.5 mm at the hand
+    there = np.isfinite(joints).all(axis=1) & (joints[:, 2] > 0)
+    if not there.any():
+        return
+    pixels = intrinsics.project(np.where(there[:, None], joints, 1))
+    radius = 0.0035 * intrinsics.fx / float(np.median(joints[there, 2]))  # 3.5 mm at the hand
     radius = float(np.clip(radius, 2, 9))
     colors = [FINGER_COLORS[finger][::-1] for finger in skeleton.fingers]
     for parent, child in skeleton.bones:
-        _line(picture, pixels[parent], pixels[child], (0, 0, 0), max(3, round(radius * 1.1)))
-        _line(picture, pixels[parent], pixels[child], colors[child], max(1, round(radius * 0.6)))
+        if there[parent] and there[child]:
+            _line(picture, pixels[parent], pixels[child], (0, 0, 0), max(3, round(radius * 1.1)))
+            _line(picture, pixels[parent], pixels[child], colors[child], max(1, round(radius * 0.6)))
     for joint in np.argsort(-joints[:, 2]):  # the nearest last, on top
-        _dot(picture, pixels[joint], radius + 1, (0, 0, 0))
-        _dot(picture, pixels[joint], radius, colors[joint])
+        if there[joint]:
+            _dot(picture, pixels[joint], radius + 1, (0, 0, 0))
+            _dot(picture, pixels[joint], radius, colors[joint])
 
 
 def draw_cube(picture: Picture, cube: Cube, intrinsics: Intrinsics,

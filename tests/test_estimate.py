@@ -322,6 +322,18 @@ def test_what_is_not_finite_is_drawn_as_no_reading(drawn):
     depth[100:110, 150:160] = 0
     np.testing.assert_array_equal(shade(broken, camera), shade(depth, camera))
     np.testing.assert_array_equal(overlay(broken, camera, [hand]), overlay(depth, camera, [hand]))
+    np.testing.assert_array_equal(shade(depth.astype(float), camera), shade(depth, camera))
+
+
+def test_joints_that_are_nowhere_are_not_drawn(drawn):
+    depth, camera, hand = drawn
+    whole, nothing = (close_up(depth, camera, hand.cube, joints) for joints in (hand.joints, np.full((21, 3), np.nan)))
+    for nowhere in (np.nan, np.inf, 0.0):
+        joints = hand.joints.copy()
+        joints[HAND21.tips[1]] = nowhere
+        picture = close_up(depth, camera, hand.cube, joints)
+        assert (picture != whole).any() and (picture != nothing).any()
+        np.testing.assert_array_equal(close_up(depth, camera, hand.cube, np.full((21, 3), nowhere)), nothing)
 
 
 def test_a_contact_sheet_is_read_like_text():

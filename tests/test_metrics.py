@@ -60,6 +60,8 @@ def test_nothing_labelled_gives_nan_and_none_not_a_number():
 def test_wrong_shapes_are_refused():
     with pytest.raises(InputError, match=r'\(2, 14, 3\).*\(2, 16, 3\)'):
         metrics.joint_errors_mm(np.zeros((2, 14, 3)), np.zeros((2, 16, 3)))
+    with pytest.raises(InputError, match='there are 14 joints, but hand21 has 21'):
+        metrics.summarise(np.zeros((2, 14, 3)), np.zeros((2, 14, 3)), HAND21)
 
 
 @given(seed=st.integers(0, 2**32 - 1))

@@ -222,8 +222,13 @@ def summarise(predictions: ArrayLike, truth: ArrayLike, skeleton: Skeleton) -> d
 
     Args:
         predictions, truth: (N, J, 3) in metres, J the joints of the skeleton.
+
+    Raises:
+        InputError: the shapes differ, or are those of another skeleton.
     """
     errors = joint_errors_mm(predictions, truth)
+    if errors.shape[1] != len(skeleton):
+        raise InputError(f'there are {errors.shape[1]} joints, but {skeleton.name} has {len(skeleton)}')
     labelled = ~np.isnan(errors)
     return finite_or_none({
         'frames': int(labelled.any(-1).sum()),

@@ -123,4 +123,3 @@ def test_wrong_input_is_named() -> None:
         finger_angles(flat_hand(), 'unknown')
     with pytest.raises(InputError, match=r'\(14, 3\)'):
         finger_angles(np.zeros((14, 3)), 'left')
-

@@ -210,7 +210,8 @@ def test_the_command_publishes_and_counts(bag, ros_domain, capsys):
     assert main(['replay', str(bag.with_name('missing.bag'))]) == 1
     assert 'missing.bag: there is no such bag' in capsys.readouterr().err
     for option, value in (('--rate', '0'), ('--start', '-1'), ('--start', 'nan'), ('--start', 'inf'),
-                          ('--start', '1e300'), ('--rate', 'inf'), ('--rate', '1e306')):
+                          ('--start', '1e300'), ('--rate', 'inf'), ('--rate', '1e306'), ('--wait', '-1'),
+                          ('--wait', 'nan')):
         with pytest.raises(SystemExit) as leaving:
             main(['replay', str(bag), option, value, '--clock'])
         assert leaving.value.code == 2

@@ -48,6 +48,8 @@ def run(args: argparse.Namespace) -> int:
         args.parser.error(f'--rate {args.rate:g}: must be more than 0, and finite')
     if not 0 <= args.start <= _ENDLESS:
         args.parser.error(f'--start {args.start:g}: must be 0 or more, and finite')
+    if not 0 <= args.wait <= _ENDLESS:
+        args.parser.error(f'--wait {args.wait:g}: must be 0 or more, and finite')
     from hand_pose_ros.ros.replay import replaying  # says what is missing where there is no ROS
 
     with replaying(args.bag, args.ros_args, topics=args.topics, rate=args.rate, reliability=args.qos, clock=args.clock,

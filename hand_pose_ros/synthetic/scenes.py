@@ -247,5 +247,3 @@ def smooth_relief(rng: Random, view: View, cells: int = 10) -> Tensor:
     """(B, H, W) metres: folds of cloth and unevenness, up to some millimetres."""
     grid = rng.normal(1, cells, cells) * (rng.uniform(1, 1, 1) * 0.004)
     return functional.interpolate(grid, (view.height, view.width), mode='bilinear')[:, 0]
-
-

@@ -148,7 +148,8 @@ def require_hands(found: Look, bag: str | Path) -> None:
     for part, name in zip(found.split(), ('learn from', 'judge on'), strict=True):
         if (count := int(torch.as_tensor(part)[found.rows].sum())) < LEAST:
             raise HandPoseError(f'{bag}: a hand was found in {count} of the {int(part.sum())} images to {name}, and '
-                                f'{LEAST} are needed: record one hand that moves before the camera for a minute or two')
+                                f'{LEAST} are needed: record one hand that moves before the camera for a minute or two '
+                                '(with --side, a hand of that side)')
 
 
 def consensus(predict: Callable[[NDArray[np.float32]], NDArray[np.float32]], crops: Batch,

@@ -99,8 +99,8 @@ def overlay(depth: NDArray[np.float32], intrinsics: Intrinsics, hands: Sequence[
         depth: (H, W) metres; 0, NaN and infinite = no reading.
         height: of the picture, pixels.
     """
-    scale = height / depth.shape[0]
-    whole = _View(depth, intrinsics, (0, 0), depth.shape[::-1], (round(depth.shape[1] * scale), height))
+    width = np.clip(depth.shape[1] * height / depth.shape[0], height / 4, 16 * height)  # of one row, it had no end
+    whole = _View(depth, intrinsics, (0, 0), depth.shape[::-1], (round(width), height))
     picture = whole.shade()
     for hand in hands:
         draw_cube(picture, hand.cube, whole.intrinsics)

@@ -336,6 +336,14 @@ def test_joints_that_are_nowhere_are_not_drawn(drawn):
         np.testing.assert_array_equal(close_up(depth, camera, hand.cube, np.full((21, 3), nowhere)), nothing)
 
 
+@pytest.mark.parametrize('shape', [(1, 4000), (4000, 1), (1, 1)])
+def test_the_thinnest_images_give_a_picture_that_can_be_written(shape):
+    height, width = shape
+    picture = overlay(np.full(shape, 0.5, np.float32), Intrinsics(2000, 2000, 0, 0, width, height), [])
+    assert picture.shape[0] == 480 and 120 <= picture.shape[1] <= 8000
+    assert cv2.imencode('.png', picture)[0]
+
+
 def test_a_contact_sheet_is_read_like_text():
     sheet = contact_sheet([np.full((2, 3, 3), value, np.uint8) for value in (50, 100, 150)], columns=2)
     assert sheet.shape == (4, 6, 3)

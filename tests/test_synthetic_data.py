@@ -1,5 +1,7 @@
 """What the generator of synthetic hands promises to those who train on it."""
 
+import shutil
+
 import cv2
 import numpy as np
 import pytest
@@ -264,6 +266,18 @@ def test_command_line_shows_writes_and_measures(tmp_path, capsys, shared_data):
     assert "unknown sensor 'kinect9'" in capsys.readouterr().err
     assert main(['synth', 'show', str(tmp_path / 'sheet.jpeg2')]) == 1
     assert 'give a name that ends in .png' in capsys.readouterr().err
+
+
+def test_real_hands_have_a_row_of_their_own_above_the_synthetic(tmp_path, shared_data):
+    for number in '30', '170':  # fewer than there are columns
+        shutil.copy(next((shared_data / 'frames' / 'sr305').rglob(f'{number}.png')), tmp_path)
+    sheet = tmp_path / 'sheets' / 'sheet.png'
+    assert main(['synth', 'show', str(sheet), '--number', '3', '--per-sensor', '--sensors', 'd435', 'sr305',
+                 '--real', str(tmp_path), '476.0', '476.0', '313.7', '242.8', '0.000125']) == 0
+    rows = np.array(np.split(cv2.imread(str(sheet)), 3)).reshape(3, 256, 3, 256, 3).swapaxes(1, 2)
+    first, second, nothing = rows[0]
+    assert (first != second).mean() > 0.05 and not nothing.any()
+    assert all(picture.std() > 20 for picture in rows[1:].reshape(6, 256, 256, 3))
 
 
 def test_benchmark_is_the_frozen_one():

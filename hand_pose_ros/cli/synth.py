@@ -109,12 +109,13 @@ def _show(args: argparse.Namespace) -> None:
     if not cv2.haveImageWriter(str(args.out)):
         raise HandPoseError(f'{args.out}: pictures of this kind cannot be written: give a name that ends in .png')
     names = args.sensors or [sensor.name for sensor in SENSORS]
-    number = args.number if not args.per_sensor else min(args.number, _COLUMNS)
+    columns = min(_COLUMNS, args.number)
+    number = columns if args.per_sensor else args.number
     pictures = []
     for name, patches in _real(args):
-        chosen = [patches[i * len(patches) // _COLUMNS][0] for i in range(min(_COLUMNS, len(patches)))]
-        row = [_relief(patch, f'real {name}') for patch in chosen]
-        pictures += row + [row[0] * 0] * (_COLUMNS - len(row)) if row else []
+        shown = min(columns, len(patches))
+        row = [_relief(patches[i * len(patches) // shown][0], f'real {name}') for i in range(shown)]
+        pictures += row + [row[0] * 0] * (columns - len(row)) if row else []
     for group in [[name] for name in names] if args.per_sensor else [names]:
         hands = _hands(args, group, ingredients=Ingredients(noise=not args.clean))
         batch = hands.batch(torch.arange(args.start, args.start + number))
@@ -125,7 +126,7 @@ def _show(args: argparse.Namespace) -> None:
             if args.joints and side != 'none':
                 _draw_joints(picture, batch['joints'][i].numpy(), batch['visible'][i].numpy())
             pictures.append(picture)
-    sheet = contact_sheet(pictures, columns=min(_COLUMNS, number))
+    sheet = contact_sheet(pictures, columns)
     write_bytes(args.out, cv2.imencode(args.out.suffix, sheet)[1].tobytes())
     print(f'{args.out}: {len(pictures)} pictures')
 

@@ -261,6 +261,12 @@ def test_command_line_shows_writes_and_measures(tmp_path, capsys, shared_data):
     assert main(['synth', 'stats', '--number', '8', *real]) == 0
     table = capsys.readouterr().out
     assert 'real sr305' in table and 'missing' in table
+    long = tmp_path / 'recorded in a house with a garden'
+    long.symlink_to(real[1])
+    assert main(['synth', 'stats', '--number', '8', '--real', str(long), *real[2:]]) == 0
+    head, *rows = capsys.readouterr().out.splitlines()
+    assert f'(quartiles)  real {long.name}  ' in head
+    assert all(row.count(')  ') == 1 for row in rows), 'columns stand apart'
 
     assert main(['synth', 'show', str(sheet), '--sensors', 'kinect9']) == 1
     assert "unknown sensor 'kinect9'" in capsys.readouterr().err

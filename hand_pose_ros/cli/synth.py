@@ -202,7 +202,9 @@ def _record(args: argparse.Namespace) -> None:
 
 
 def _stats(args: argparse.Namespace) -> None:
+    from hand_pose_ros.evaluation.tables import text_table
     from hand_pose_ros.synthetic.statistics import summarise
+
     columns = {f'real {name}': summarise(patches) for name, patches in _real(args)}
     hands, patches = _hands(args, args.sensors), []
     for indices in _indices(args.start, args.number, 64):
@@ -210,7 +212,6 @@ def _stats(args: argparse.Namespace) -> None:
         patches += [(batch['patch'][i, 0].numpy(), float(batch['cube_side'][i]))
                     for i in batch['hand_present'].nonzero()[:, 0].tolist()]
     columns['synthetic'] = summarise(patches)
-    print('median (quartiles)'.ljust(20) + ''.join(name.rjust(26) for name in columns))
-    for row in columns['synthetic']:
-        cells = (f'{column[row][1]:.3g} ({column[row][0]:.3g} - {column[row][2]:.3g})' for column in columns.values())
-        print(row.ljust(20) + ''.join(cell.rjust(26) for cell in cells))
+    print(text_table(('median (quartiles)', *columns), [
+        (row, *(f'{column[row][1]:.3g} ({column[row][0]:.3g} - {column[row][2]:.3g})' for column in columns.values()))
+        for row in columns['synthetic']]))

@@ -47,7 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                       help='16-bit depth PNGs, their camera in pixels and metres per unit; may be repeated')
     actions = parser.add_subparsers(dest='action', metavar='show|write|record|stats', required=True)
 
-    show = actions.add_parser('show', parents=[common, real], help='a contact sheet')
+    show = actions.add_parser('show', parents=[common, real],
+                              help='a contact sheet; left hands mirrored, as networks see them')
     show.add_argument('out', type=Path, metavar='FILE', help='a PNG')
     show.add_argument('--number', type=count, default=48, metavar='N', help='samples, or columns per sensor (48)')
     show.add_argument('--joints', action='store_true', help='draw the joints; hidden ones hollow')

@@ -24,6 +24,8 @@ import hand_pose_ros.estimator
 from hand_pose_ros.depth import read_png
 from hand_pose_ros.drawing import contact_sheet, overlay
 from hand_pose_ros.estimator import HandEstimate, HandPoseEstimator
+from hand_pose_ros.evaluation.metrics import finite_or_none
+from hand_pose_ros.files import write_json
 from hand_pose_ros.geometry import Intrinsics
 
 
@@ -93,7 +95,7 @@ def main() -> None:
     for name, row in table.items():
         print(f'{name:<28}' + '  '.join(f'{key} {value}' for key, value in row.items()))
     if args.json:
-        args.json.write_text(json.dumps(table, indent=2) + '\n')
+        write_json(args.json, finite_or_none(table))
 
 
 if __name__ == '__main__':

@@ -1,6 +1,7 @@
 """The scripts in examples/ do what they say, with the weights that ship, on synthetic hands."""
 
 import csv
+import json
 import re
 import runpy
 import shlex
@@ -249,3 +250,14 @@ def test_gripper_says_once_that_it_needs_the_joints_of_hand21(gripper: Any, capf
     assert not gripper.openings
     said = capfd.readouterr().err
     assert said.count('hand21') == 1 and "'msra21': start the node with a model of hand21" in said
+
+
+def test_annotated_frames_in_which_no_hand_is_found_are_counted_in_json(tmp_path, shared_data):
+    subprocess.run([sys.executable, CHECKOUT / 'benchmarks' / 'annotated_frames.py', shared_data / 'frames',
+                    '--model', 'deep_prior', '--min-score', '1', '--json', tmp_path / 'new' / 'a.json'], check=True)
+
+    def no_number(text: str) -> None:
+        raise AssertionError(f'{text} is not JSON')
+
+    rows = json.loads((tmp_path / 'new' / 'a.json').read_text(), parse_constant=no_number)
+    assert all(row['missed'] == row['tips'] > 0 and row['median_mm'] is None for row in rows.values())

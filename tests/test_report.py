@@ -131,6 +131,15 @@ def test_labels_scored_as_predictions_are_drawn_at_zero(result):
     assert axes.get_ylim()[0] == 0
 
 
+def test_mean_errors_are_in_view_where_every_frame_lacks_a_joint(result):
+    predictions = result.predictions.copy()
+    predictions[:, 4] = np.nan
+    lacking = replace(result, predictions=predictions)
+    (axes,) = plots.over_time(lacking).axes
+    means = metrics.frame_means_mm(lacking.errors_mm)
+    assert axes.get_ylim()[1] > means[np.isfinite(means)].max()
+
+
 @pytest.mark.parametrize('stamps', [np.zeros(40, int), np.arange(40) % 20], ids=['all 0', 'of a loop'])
 def test_images_without_a_time_of_their_own_are_drawn_in_order(result, stamps):
     odd = replace(result, stamps_ns=stamps)

@@ -87,7 +87,9 @@ def over_time(result: Result) -> Figure:
     _band(axes, at, worst, COLORS[5], 'worst joint')
     _band(axes, at, means, COLORS[0], 'mean of joints')
     missed = metrics.missed_frames(errors)
-    top = np.nanpercentile(worst[np.isfinite(worst)], 99.8) * 1.05 if np.isfinite(worst).any() else 0
+    highest = np.where(np.isfinite(worst), worst, means)  # a frame that lacks a joint has a mean all the same
+    highest = highest[np.isfinite(highest)]
+    top = np.percentile(highest, 99.8) * 1.05 if highest.size else 0
     if missed.any():
         axes.plot(at[missed], np.full(missed.sum(), 0.01 * top), '|', color=COLORS[1], ms=9, clip_on=False,
                   label='missed')

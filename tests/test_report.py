@@ -18,6 +18,7 @@ from hand_pose_ros.evaluation.report import write_report
 from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.skeleton import HAND21
+from hand_pose_ros.training.figures import runtime
 
 CAMERA = Intrinsics(400, 400, 159.5, 119.5, 320, 240)
 
@@ -169,6 +170,12 @@ def test_any_name_of_a_result_can_be_drawn(result, tmp_path):
     write_report(odd, tmp_path)
     for figure in plots.curves(odd), plots.joint_bars(odd):
         assert all(any(one.name in entry for entry in legends(figure)) for one in odd)
+
+
+def test_times_beside_those_of_the_paper_have_numbers_at_their_axis():
+    figure = runtime({'deep|eager': {'p50_ms': 40.0}, 'deep|fast': {'p50_ms': 0.2}}, {'deep': (0.1, 2.0)})
+    figure.draw_without_rendering()
+    assert {'1', '10'} <= {label.get_text() for label in figure.axes[0].get_yticklabels()}
 
 
 def test_many_results_with_long_names_can_be_told_apart(result):

@@ -237,6 +237,22 @@ def test_a_browser_shows_the_report_and_turns_the_hands(result, tmp_path, chromi
         assert (np.abs(page.astype(int) - bgr).max(-1) < 12).sum() > 200, f'no {bgr} on the page'
 
 
+def test_a_browser_shows_an_estimate_however_far_before_the_truth(result, tmp_path, chromium):
+    predictions = result.truth.copy()
+    predictions[3, :, 2] -= 0.9  # it fits no view, and is the worst
+    path = write_report([replace(result, predictions=predictions)], tmp_path / 'out')
+    probe = """<script>
+      const canvas = [...document.querySelectorAll('canvas')].pop();
+      const data = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
+      let thumb = 0;
+      for (let k = 0; k < data.length; k += 4) thumb += data[k] > 240 && data[k + 1] < 110 && data[k + 2] < 100;
+      document.title = thumb;
+    </script></body>"""
+    path.write_text(path.read_text().replace('</body>', probe))
+    dom = chromium('--dump-dom', '--window-size=1200,3000', f'file://{path}', profile=tmp_path / 'a')
+    assert int(re.search(r'<title>(\d+)</title>', dom)[1]) > 10
+
+
 def test_compare_prints_tables_and_intervals(result, tmp_path, capsys):
     better = Result('better', HAND21, CAMERA, (result.predictions + result.truth) / 2, result.truth)
     result.save(tmp_path / 'a.npz')

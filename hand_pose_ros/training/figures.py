@@ -67,6 +67,7 @@ def runtime(rows: Mapping[str, Mapping[str, float]], paper_ms: Mapping[str, tupl
     for k, (name, values) in enumerate(bars.items()):
         axes.bar(at + (k - 1) * 0.27, values, 0.25, color=COLORS[k], label=name)
     axes.set_yscale('log')
+    axes.yaxis.set_major_formatter('{x:g}')
     axes.set_xticks(at, list(paper_ms))
     axes.set(title='Time for one hand, ms')
     axes.legend(fontsize=9)

@@ -136,6 +136,18 @@ def test_hands_do_not_influence_each_other():
     np.testing.assert_allclose(engine.run(patches), alone, atol=1e-5)
 
 
+@pytest.mark.parametrize('architecture', ['shallow', 'hand_dense', 'two_looks'])
+def test_no_hands_get_an_empty_answer(architecture):
+    network = trained(architecture)
+    refiner = None if hasattr(network, 'outputs') else trained_refiner('or_ref')
+    nothing = np.zeros((0, 1, 128, 128), np.float32)
+    answer = make_engine(network, 'cpu', refiner=refiner).run_full(nothing)
+    expected = TorchEngine(Pipeline(network, refiner)).run_full(nothing)
+    assert {name: array.shape for name, array in answer.items()} == {
+        name: array.shape for name, array in expected.items()}
+    assert answer['joints'].shape == (0, 21, 3)
+
+
 def test_everything_the_network_says_comes_through():
     network = trained('hand_dense')
     patches = hand_patches(2)

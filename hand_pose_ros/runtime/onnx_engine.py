@@ -92,5 +92,7 @@ class OnnxEngine(Engine):
                 self._one, self.threads = alone, 1
 
     def _run(self, patches: Array) -> list[Array]:
+        if not len(patches):  # of which ONNX Runtime cannot work out all shapes
+            return [answer[:0] for answer in self._run(np.ones((1, *patches.shape[1:]), np.float32))]
         session = self._one if len(patches) == 1 else self._many
         return session.run(None, {'patches': np.ascontiguousarray(patches)})

@@ -91,7 +91,9 @@ def _finger(bones: NDArray[np.float64], abducting: int) -> list[NDArray[np.float
     along = np.cos(pip)[..., None] * first + np.sin(pip)[..., None] * palmar
     palmar = np.cos(pip)[..., None] * palmar - np.sin(pip)[..., None] * first
     dip = np.arctan2(_dot(bones[..., 2, :], palmar), _dot(bones[..., 2, :], along))
-    return [flexion, abducting * abduction, pip, dip]
+    # A hinge behind a bone that has no direction does not bend against it.
+    there = np.any(bones != 0, axis=-1)
+    return [flexion, abducting * abduction, pip * there[..., 0], dip * there[..., :2].all(-1)]
 
 
 def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:

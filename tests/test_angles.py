@@ -118,6 +118,17 @@ def test_a_hand_without_extent_has_no_angles_but_no_nan_either() -> None:
     assert (finger_angles(np.zeros((21, 3)), 'right') == 0).all()
 
 
+@pytest.mark.parametrize('bone', range(3))
+def test_a_bone_without_length_gives_no_angle_of_its_own_or_against_it(bone: int) -> None:
+    joints = synthetic(index_mcp_flexion=20, index_mcp_abduction=10, index_pip_flexion=30, index_dip_flexion=40)
+    joints[6 + bone:9] += joints[5 + bone] - joints[6 + bone]  # what is behind it goes along
+    angles = in_degrees(joints)
+    without = (('mcp_flexion', 'mcp_abduction', 'pip_flexion', 'dip_flexion'), ('pip_flexion', 'dip_flexion'),
+               ('dip_flexion',))[bone]
+    for angle in ('mcp_flexion', 'mcp_abduction', 'pip_flexion', 'dip_flexion'):
+        assert (angles[f'index_{angle}'] == 0) == (angle in without), angle
+
+
 def test_wrong_input_is_named() -> None:
     with pytest.raises(InputError, match=r"'unknown'"):
         finger_angles(flat_hand(), 'unknown')

@@ -468,6 +468,25 @@ def test_a_machine_is_not_called_slow_while_camera_info_is_missing(rig: Rig) -> 
     assert not any('too slow' in text for text in rig.said())
 
 
+def test_nor_where_camera_info_is_wrong_now_and_then(rig: Rig) -> None:
+    node = rig.start(camera_info_timeout=9.0)
+    publish, picture = rig.camera(RELIABLE), image(depth_with_hand())
+    infos = rig.client.create_publisher(CameraInfo, 'depth/camera_info', RELIABLE)
+    rig.connected(infos)
+    reports = rig.received[DiagnosticArray]
+    seen = len(reports)
+    while len(reports) < seen + 4:
+        infos.publish(camera_info())
+        rig.answer(publish, picture)
+        infos.publish(camera_info(2 * WIDTH, 2 * HEIGHT))
+        rig.until(lambda: node._camera._info.width == 2 * WIDTH, 'the wrong one')
+        received = node._statistics._totals['received']
+        for number in range(received + 1, received + 21):
+            publish(picture)
+            rig.until(lambda n=number: node._statistics._totals['received'] == n, 'the image')
+    assert not any('too slow' in text for text in rig.said())
+
+
 def test_an_image_waits_for_the_camera_info_that_comes_after_it(rig: Rig) -> None:
     rig.start(camera_info_timeout=5.0)
     publish = rig.camera()

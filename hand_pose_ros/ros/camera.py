@@ -24,12 +24,15 @@ class Camera:
     Args:
         topic: of the camera_info.
         remedy: what else may be done where there is none.
+
+    Attributes:
+        waiting: whether an image waits for its camera_info just now.
     """
 
     def __init__(self, topic: str, remedy: str = 'set the parameters intrinsics.fx, .fy, .cx and .cy') -> None:
         self.topic, self._remedy = topic, remedy
         self._info: CameraInfo | None = None
-        self._closed = False
+        self._closed = self.waiting = False
         self._changed = threading.Condition()
 
     def update(self, info: CameraInfo) -> None:
@@ -67,7 +70,9 @@ class Camera:
             return self._fits(width, height, params.use_rectified)
 
         with self._changed:
+            self.waiting = True
             self._changed.wait_for(lambda: self._closed or fits(), params.camera_info_timeout)
+            self.waiting = False
             if self._closed and not fits():
                 raise Closed
             info = self._info

@@ -38,6 +38,8 @@ class _Window:
 class Statistics:
     """Counts (received, dropped, refused, answered; camera_infos, hands) and times; for use from several threads.
 
+    Those `waited` are of the dropped ones, overtaken while another waited for its camera_info.
+
     Attributes:
         failure: why the node could not do as it was told, empty if it could.
         silence: why images stay away, empty if they do not.
@@ -136,9 +138,9 @@ def _judge(window: _Window, state: str, arrived: Counter[str], silence: str) -> 
                                        f'arrived: if there should be as many, {remedy_for_lost_images()}')
     if counts['received'] == 0:
         return DiagnosticStatus.STALE, 'no images'
-    # Where none was answered, they wait for something, like their camera_info, and that is said in its time.
-    too_many = counts['dropped'] > MAX_DROPPED * counts['received']
-    if counts['received'] >= MIN_SAMPLE and counts['answered'] and too_many:
+    # That images wait for their camera_info is said in its time.
+    too_many = counts['dropped'] - counts['waited'] > MAX_DROPPED * counts['received']
+    if counts['received'] >= MIN_SAMPLE and too_many:
         return DiagnosticStatus.WARN, (f'{counts["dropped"]} of {counts["received"]} images of a second were dropped: '
                                        'this machine is too slow, or too busy, for their rate')
     return DiagnosticStatus.OK, f'{counts["answered"]} images answered, {counts["hands"]} hands'

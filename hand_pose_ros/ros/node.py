@@ -195,7 +195,8 @@ class EstimatorNode(LifecycleNode):
 
     def _on_image(self, image: Image | CompressedImage) -> None:
         self._heard_at, self._statistics.silence = time.monotonic(), ''
-        self._statistics.count(received=1, dropped=int(self._worker is not None and self._worker.put(image)))
+        dropped = int(self._worker is not None and self._worker.put(image))
+        self._statistics.count(received=1, dropped=dropped, waited=int(dropped and self._camera.waiting))
 
     def _on_camera_info(self, info: CameraInfo) -> None:
         self._statistics.count(camera_infos=1)

@@ -2,7 +2,8 @@
 
 The geometry is exact. Cube units follow the rays of the camera, so another cube around the same scene is an affine
 map of patch and joints, and a turn of the patch about its centre is a roll of the camera, if the centre of the cube is
-turned along. What the new cube sees beyond the old one is unknown and becomes background.
+turned along. What the new cube sees beyond the old one is unknown and becomes background; but what was before the
+front face of the old one, and shown there, stays at that depth.
 """
 
 from __future__ import annotations

@@ -20,8 +20,8 @@ from hand_pose_ros.geometry import PATCH_SIZE
 from hand_pose_ros.models.dense import HandDense
 
 ZOOM = 0.95
-"""Half the width of a view, in cube units, of a hand that has the usual size: one hand in a hundred then has a joint
-that is further out than 0.86."""
+"""Half the width of a view, in cube units, of a hand that has the usual size: two hands in a hundred then have a
+joint that is further out than 0.86."""
 MAX_SIZE = 0.4
 """What the first look tells of the size (a logarithm) counts up to this."""
 STEPS = 64

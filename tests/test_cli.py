@@ -1,13 +1,16 @@
 """The `hand-pose` command as a whole: every verb explains itself, and the exit codes mean what they say."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from hand_pose_ros.cli import VERBS, main
+from hand_pose_ros.resources import resource
 from hand_pose_ros.synthetic.sensors import SENSORS
 
 
@@ -81,3 +84,30 @@ def test_to_view_without_a_display_is_refused_at_once(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, 'rerun', None)  # else who then says --save only learns that Rerun is missing
     assert main(['view', str(bag)]) == 1
     assert "'.[view]'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('unbuffered', ['', '1'])
+def test_output_that_cannot_be_printed_is_one_sentence(unbuffered):
+    command = [sys.executable, '-m', 'hand_pose_ros.cli', 'estimator', '--parameters']
+    with open('/dev/full', 'w') as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True,
+                              env={**os.environ, 'PYTHONUNBUFFERED': unbuffered})
+    assert done.returncode == 1 and 'No space left' in done.stderr and done.stderr.count('\n') == 1
+
+
+def test_a_reader_that_leaves_early_is_one_sentence():
+    reading, writing = os.pipe()
+    os.close(reading)
+    done = subprocess.run([sys.executable, '-m', 'hand_pose_ros.cli', 'estimator', '--parameters'], stdout=writing,
+                          stderr=subprocess.PIPE, text=True)
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (1, 'hand-pose estimator: standard output: Broken pipe\n')
+
+
+def test_files_are_written_where_the_standard_streams_are_closed(tmp_path):
+    command = [sys.executable, '-m', 'hand_pose_ros.cli', 'estimate', str(resource('demo/depth.png')), '--intrinsics',
+               '364.5', '364.5', '256', '208', '--out', str(tmp_path / 'hand.npz')]
+    done = subprocess.run(['bash', '-c', '"$@" <&- >&- 2>&-', 'bash', *command])
+    assert done.returncode == 0
+    with np.load(tmp_path / 'hand.npz') as file:
+        assert len(file['joints']) == 1

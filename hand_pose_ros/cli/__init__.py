@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import signal
 import sys
 from collections.abc import Iterator, Sequence
@@ -58,8 +59,38 @@ def _ending_like_ctrl_c() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
+def _open_standard_streams() -> None:
+    """Those that are closed lead nowhere: else a file that is opened takes their place, and what libraries print."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # the lowest number that is free
+    sys.stdout, sys.stderr = (stream or open(os.devnull, 'w') for stream in (sys.stdout, sys.stderr))  # noqa: SIM115
+
+
+@contextmanager
+def _printing() -> Iterator[None]:
+    """What cannot be printed, as into `| head` or onto a full disk, is an OSError, and not told again at exit."""
+    try:
+        try:
+            yield
+        finally:
+            sys.stdout.flush()
+    except OSError as error:
+        if isinstance(error, BrokenPipeError):
+            error.filename = 'standard output'
+        try:
+            sys.stdout.flush()
+        except OSError:
+            error.filename = 'standard output'
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb and return the exit code."""
+    _open_standard_streams()
     argv = list(sys.argv[1:] if argv is None else argv)
     parser = _Parser(
         prog='hand-pose', description='3D hand joints from depth images.',
@@ -82,7 +113,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         hint = f'; {module.HINT}' if hasattr(module, 'HINT') else ''
         args.parser.error(f'unrecognized arguments: {" ".join(unknown)}{hint}')
     try:
-        with _ending_like_ctrl_c():
+        with _ending_like_ctrl_c(), _printing():
             return module.run(args)
     except HandPoseError as error:
         print(f'hand-pose {args.verb}: {error}', file=sys.stderr)

@@ -334,6 +334,16 @@ def test_a_folder_where_a_bag_of_one_file_is_to_be_is_refused_at_once(tmp_path):
         Bag(tmp_path / 'bag.mcap')
 
 
+@pytest.mark.parametrize('metadata', ['rosbag2_bagfile_information:\n  files: [\n', 'a: b: c\n'])
+def test_metadata_that_is_damaged_is_told_in_one_line(tmp_path, depths, metadata):
+    write(tmp_path / 'bag', depths)
+    (tmp_path / 'bag' / 'metadata.yaml').write_text(metadata)
+    (tmp_path / 'bag' / 'another.mcap').touch()  # else the only file would be read without it
+    with pytest.raises(InputError, match=r'cannot be opened .*reindex') as caught:
+        Bag(tmp_path / 'bag')
+    assert '\n' not in str(caught.value)
+
+
 def test_a_bag_that_was_closed_is_not_called_damaged(tmp_path, depths):
     with DepthBag(write(tmp_path / 'bag.mcap', depths)) as bag:
         frames = iter(bag)

@@ -72,7 +72,7 @@ class Bag:
                 count += 1
         except Exception as error:  # errors of sqlite and of the decompressors come through as they are
             self._check_open()
-            raise InputError(f'{self.path}: the bag is damaged after {count} messages ({error}); '
+            raise InputError(f'{self.path}: the bag is damaged after {count} messages ({_said(error)}); '
                              f'{_remedy(self.path)}') from error
         if self._interrupted:
             raise InputError(f'{self.path}: the bag was cut short after {count} messages, as by an interrupted '
@@ -96,8 +96,8 @@ class Bag:
             if bytes(data[:4]) == b'\x28\xb5\x2f\xfd':  # of zstd; only metadata.yaml tells that messages are compressed
                 raise InputError(f'{self.path}: its messages are compressed, as metadata.yaml says: give the folder '
                                  'that holds both, or make it anew with: ros2 bag reindex FOLDER') from error
-            raise InputError(f'{self.path}: a message on {connection.topic} is damaged ({error}): record or copy '
-                             'the bag again') from error
+            raise InputError(f'{self.path}: a message on {connection.topic} is damaged ({_said(error)}): record or '
+                             'copy the bag again') from error
 
     def close(self) -> None:
         """Close the files; the bag cannot be read any more."""
@@ -139,7 +139,12 @@ def _open(path: Path) -> tuple[AnyReader, bool]:
             failure = InputError('it was cut short before its first chunk was complete')
         except Exception as error:  # errors of sqlite, YAML and of the decompressors come through as they are
             failure = failure or error
-    raise InputError(f'{path}: the bag cannot be opened ({failure}); {_remedy(path)}') from failure
+    raise InputError(f'{path}: the bag cannot be opened ({_said(failure)}); {_remedy(path)}') from failure
+
+
+def _said(error: Exception | None) -> str:
+    """What a library said, in one line; its kind if it said nothing."""
+    return ' '.join(str(error).split()) or type(error).__name__
 
 
 def _remedy(path: Path) -> str:

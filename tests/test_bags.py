@@ -344,6 +344,15 @@ def test_metadata_that_is_damaged_is_told_in_one_line(tmp_path, depths, metadata
     assert '\n' not in str(caught.value)
 
 
+def test_camera_infos_that_are_counted_but_lost_are_told(tmp_path, depths):
+    path = write(tmp_path / 'bag', depths, storage='sqlite3')
+    with sqlite3.connect(path / 'bag.db3') as database:
+        database.execute("DELETE FROM messages WHERE topic_id = (SELECT id FROM topics WHERE name LIKE '%camera_info')")
+    with pytest.raises(InputError, match='bag: the bag counts messages of camera_info that are not there'), \
+            DepthBag(path) as bag:
+        next(iter(bag))
+
+
 def test_a_bag_that_was_closed_is_not_called_damaged(tmp_path, depths):
     with DepthBag(write(tmp_path / 'bag.mcap', depths)) as bag:
         frames = iter(bag)

@@ -116,7 +116,8 @@ class DepthBag(Bag):
                     continue
                 header = message.header
                 if not cameras and not self._intrinsics:
-                    raise InputError(self._unusable)
+                    raise InputError(self._unusable or f'{self.path}: the bag counts messages of camera_info that are '
+                                     'not there: copy it again, or give --intrinsics FX FY CX CY')
                 camera = self._intrinsics if not cameras else cameras.get(header.frame_id, cameras[''])
                 yield Frame(stamp_ns(header), header.frame_id, self.depth_topic, recorded_ns, message, camera,
                             self._depth_scale)

@@ -455,6 +455,15 @@ def test_camera_info_that_was_published_once_before_the_node_came_is_taken(rig: 
         return bool(answers)
     rig.until(answered, 'an answer')
     assert answers[0].hands
+    # One that is published all the time is heard beside it, without a word about quality of service.
+    rig.until(lambda: rig.node._latched, 'the node to listen to what is kept')
+    infos = rig.client.create_publisher(CameraInfo, 'depth/camera_info', BEST_EFFORT)
+    rig.connected(infos)
+    infos.publish(camera_info(WIDTH // 2, HEIGHT // 2, FOCAL / 2))
+    assert rig.answer(publish, image(depth_with_hand()[::2, ::2])).hands
+    assert rig.transition('deactivate') and rig.transition('activate')
+    rig.until(lambda: sum('listening to' in text for text in rig.said()) == 2, 'to hear all that was said before')
+    assert not any('incompatible' in text for text in rig.said())
 
 
 def test_a_machine_is_not_called_slow_while_camera_info_is_missing(rig: Rig) -> None:

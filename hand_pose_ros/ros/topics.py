@@ -62,12 +62,14 @@ def subscribe(node: Node, message_type: type, topic: str, callback: Callable[...
 def subscribe_latched(node: Node, message_type: type, topic: str, callback: Callable[..., None]) -> Subscription | None:
     """Listen, too, to what was said once and is kept for whoever comes later; None if there is nobody to listen to.
 
-    Only where all publishers are transient local: others would log an incompatible QoS.
+    Only where all publishers are transient local: others would log an incompatible QoS. Should one come later, it is
+    heard all the same, by who listens without this: nothing is said of it here.
     """
     infos = node.get_publishers_info_by_topic(topic)
     if not infos or any(info.qos_profile.durability != qos.LATCHED.durability for info in infos):
         return None
-    return node.create_subscription(message_type, topic, callback, qos.LATCHED)
+    return node.create_subscription(message_type, topic, callback, qos.LATCHED,
+                                    event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
 
 
 def describe_publishers(node: Node, topic: str) -> str:

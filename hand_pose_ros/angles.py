@@ -11,7 +11,9 @@ Names as in anatomy; all 0 when a finger is straight and parallel to the middle 
 - `<finger>_pip_flexion`, `<finger>_dip_flexion`: of the next two bones, each against the one before.
 - `thumb_cmc_flexion`: of the thumb's metacarpal across the palm, in its plane; spread away from the hand is negative.
 - `thumb_cmc_abduction`: of the thumb's metacarpal out of that plane (palmar abduction).
-- `thumb_mcp_flexion`, `thumb_ip_flexion`: the whole bend of the joint, positive towards the little finger's knuckle.
+- `thumb_mcp_flexion`, `thumb_ip_flexion`: the whole bend of the joint, positive towards the root of the little finger,
+  negative away from it. A bend that is nearly sideways, as of an MCP that is abducted, counts less the nearer it is to
+  that, so that the angle passes through 0 and does not jump.
 
 Rotation about the axis of a bone leaves no trace in the positions: it is not given.
 """
@@ -32,6 +34,12 @@ ANGLES = ('thumb_cmc_flexion', 'thumb_cmc_abduction', 'thumb_mcp_flexion', 'thum
 _JOINT = {name: i for i, name in enumerate(HAND21.joint_names)}
 _ABDUCTING = {'index': 1, 'middle': 1, 'ring': -1, 'pinky': -1}
 """Sign of x in the direction that abducts."""
+_BELOW = 0.2
+"""Of the palm's length: the thumb flexes towards what is so far below the little finger's knuckle. In synthetic
+poses 52 of 6,706 bends of its MCP by more than 5 degrees have the wrong sign then, and none of 7,196 of its IP; towards
+the knuckle itself 78 and 4."""
+_SIDEWAYS = 0.5
+"""Cosine between the direction of a bend and that of flexion, from which the whole bend counts."""
 
 
 def finger_angles(joints: ArrayLike, side: str) -> NDArray[np.float64]:
@@ -63,7 +71,8 @@ def finger_angles(joints: ArrayLike, side: str) -> NDArray[np.float64]:
     digits = digits.reshape(*digits.shape[:-2], 5, 4, 3)
     bones = _unit(np.diff(digits, axis=-2))
 
-    angles = _thumb(bones[..., 0, :, :], towards=digits[..., 4, 0, :] - digits[..., 0, 1, :])
+    root = digits[..., 4, 0, :] - _BELOW * digits[..., 2, 0, :]  # of the little finger
+    angles = _thumb(bones[..., 0, :, :], towards=root - digits[..., 0, 1, :])
     for i, finger in enumerate(FINGERS[1:], start=1):
         angles += _finger(bones[..., i, :, :], _ABDUCTING[finger])
     return np.stack(angles, -1)
@@ -74,9 +83,9 @@ def _thumb(bones: NDArray[np.float64], towards: NDArray[np.float64]) -> list[NDA
     metacarpal = bones[..., 0, :]
     bends = []
     for before, after in ((metacarpal, bones[..., 1, :]), (bones[..., 1, :], bones[..., 2, :])):
-        bend = np.arctan2(np.linalg.norm(np.cross(before, after), axis=-1), _dot(before, after))
-        sideways = towards - _dot(towards, before)[..., None] * before
-        bends.append(np.where(_dot(after, sideways) < 0, -bend, bend))
+        across, flexion = (each - _dot(each, before)[..., None] * before for each in (after, towards))
+        bend = np.arctan2(np.linalg.norm(across, axis=-1), _dot(before, after))
+        bends.append(bend * np.clip(_dot(_unit(across), _unit(flexion)) / _SIDEWAYS, -1, 1))
     return [np.arctan2(-metacarpal[..., 0], metacarpal[..., 1]), np.arcsin(np.clip(metacarpal[..., 2], -1, 1)), *bends]
 
 

@@ -114,6 +114,17 @@ def test_the_thumb_of_the_synthetic_hand_comes_back(radial: float, palmar: float
                                 thumb_ip_flexion=-20))['thumb_ip_flexion'] == pytest.approx(-20, abs=0.1)
 
 
+@settings(max_examples=40, deadline=None)
+@given(radial=st.floats(0, 55), palmar=st.floats(-5, 50), abduction=st.floats(-18, 18))
+def test_the_angles_of_the_thumb_do_not_jump(radial: float, palmar: float, abduction: float) -> None:
+    angles = np.array([[in_degrees(synthetic(
+        thumb_cmc_radial=radial, thumb_cmc_palmar=palmar, thumb_mcp_flexion=mcp, thumb_mcp_abduction=abduction))[name]
+        for name in ('thumb_mcp_flexion', 'thumb_ip_flexion')] for mcp in np.arange(-20, 60, 2.0)])
+    # A degree of flexion turns the direction of a bend of 10 degrees by 6, and with it what counts of it.
+    assert np.abs(np.diff(angles[:, 0])).max() < 8
+    assert np.abs(np.diff(angles[:, 1])).max() < 8
+
+
 def test_a_hand_without_extent_has_no_angles_but_no_nan_either() -> None:
     assert (finger_angles(np.zeros((21, 3)), 'right') == 0).all()
 

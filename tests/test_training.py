@@ -24,7 +24,7 @@ from hand_pose_ros.cli import main
 from hand_pose_ros.cli.experiment import NAMES
 from hand_pose_ros.datasets import Batch, Dataset, icvl, joints_in_metres, open_dataset
 from hand_pose_ros.datasets.shards import MemoryShards
-from hand_pose_ros.errors import HandPoseError
+from hand_pose_ros.errors import CheckpointError, HandPoseError
 from hand_pose_ros.geometry import Cube, Intrinsics, crop
 from hand_pose_ros.models import build
 from hand_pose_ros.models.checkpoints import load_checkpoint, save_checkpoint
@@ -403,12 +403,26 @@ def test_a_stopped_run_continues_bit_for_bit(folder, tmp_path, recipe):
     facts = load_checkpoint(tmp_path / 'stopped' / 'last.safetensors').metadata  # weights to use
     assert (facts['samples'], facts['validation']) == (28, {})
     metrics = tmp_path / 'stopped' / 'metrics.jsonl'  # as a process that was killed long after its last state leaves it
-    metrics.write_text('{"step": 3, "samples": 12}\n{"step": 8, "samples": 32}\n{"step": 9, "sam')
+    metrics.write_bytes(b'{"step": 3, "samples": 12}\n{"step": 4, "sam\xab": 16\nnull\n{"step": 8, "samples": 32}\n'
+                        b'{"step": 9, "sam')
     again = tiny(folder, *overrides, recipe=recipe, out=tmp_path / 'stopped')
     again.train(resume=True)
     assert same_state(tmp_path / 'whole', tmp_path / 'stopped')
     assert [json.loads(line)['step'] for line in metrics.read_text().splitlines()] == [3, 10, 10]
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+@pytest.mark.parametrize(('whole', 'damaged'), [
+    (rb'\"step\"', rb'\"stop\"'), (b'optimizer.0', b'optimizer.x'), (b'"trained.network.', b'"trained.netwerk.')])
+def test_a_damaged_state_is_named_in_one_line(folder, tmp_path, whole, damaged):
+    tiny(folder, 'samples=8', out=tmp_path).train()
+    state = tmp_path / 'state.safetensors'
+    data = state.read_bytes()
+    assert whole in data
+    state.write_bytes(data.replace(whole, damaged, 1))
+    with pytest.raises(CheckpointError, match=r'state.safetensors cannot be resumed from: .') as caught:
+        tiny(folder, 'samples=8', out=tmp_path).train(resume=True)
+    assert '\n' not in str(caught.value)
 
 
 def command(folder: Path, out: Path, *overrides: str) -> list[str]:

@@ -85,7 +85,7 @@ class RunFolder:
         """Begin to write; what was written after this step, or so many samples, of a run that goes on is forgotten."""
         metrics = self.path / 'metrics.jsonl'
         if metrics.exists():
-            lines = metrics.read_text().splitlines(keepends=True)
+            lines = metrics.read_text('utf-8', 'replace').splitlines(keepends=True)
             write_bytes(metrics, ''.join(line for line in lines if _step(line) <= step).encode())
         self._log = logging.FileHandler(self.path / 'log.txt')
         self._log.setFormatter(logging.Formatter('%(asctime)s %(message)s'))
@@ -119,7 +119,7 @@ class RunFolder:
 def _step(line: str) -> float:
     try:
         return float(json.loads(line)['step'])
-    except (ValueError, KeyError):  # the last one, of a process that was killed
+    except (ValueError, KeyError, TypeError):  # damaged, or the last one of a process that was killed
         return float('inf')
 
 

@@ -50,15 +50,17 @@ def load_state(path: Path, modules: dict[str, nn.Module], optimizer: Optimizer) 
             progress = json.loads(file.metadata()['json'])
         for name, module in modules.items():
             module.load_state_dict(_under(tensors, name))
+        state: dict[int, dict[str, Tensor]] = {}
+        for key, value in _under(tensors, 'optimizer').items():
+            index, name = key.split('.', 1)
+            state.setdefault(int(index), {})[name] = value
+        optimizer.load_state_dict({'state': state, 'param_groups': optimizer.state_dict()['param_groups']})
+        if missing := {'step', 'best_mm', 'data'} - progress.keys():
+            raise ValueError(f'it does not say its {min(missing)}')
     except FileNotFoundError as error:
         raise CheckpointError(f'{path} is missing: there is nothing to resume; start without --resume') from error
-    except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise CheckpointError(f'{path} cannot be resumed from: {error}') from error
-    state: dict[int, dict[str, Tensor]] = {}
-    for key, value in _under(tensors, 'optimizer').items():
-        index, name = key.split('.', 1)
-        state.setdefault(int(index), {})[name] = value
-    optimizer.load_state_dict({'state': state, 'param_groups': optimizer.state_dict()['param_groups']})
+    except (SafetensorError, AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise CheckpointError(f"{path} cannot be resumed from: {' '.join(str(error).split())}") from error
     return progress
 
 

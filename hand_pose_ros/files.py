@@ -39,13 +39,16 @@ def in_one_step(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def naming_full_disk(path: str | Path) -> Iterator[None]:
-    """Raise InputError with the name of the file if what is done ends because a disk is full."""
+    """Raise InputError with the name of the file if what is done ends because a disk is full, or takes no such file."""
     try:
         yield
     except Exception as error:  # libraries say it with exceptions of their own
         if re.search('No space left|disk is full|quota exceeded', str(error), re.IGNORECASE):
             raise InputError(f'{path}: cannot be written, for the disk is full: make room, or choose another place'
                              ) from error
+        # As with 4 GB on FAT, with ulimit -f, or with a disk that was pulled out; SQLite calls all of it an I/O error.
+        if re.search('File too large|Input/output error|disk I/O error', str(error)):
+            raise InputError(f'{path}: cannot be written ({error}): choose another place') from error
         raise
 
 

@@ -2,6 +2,8 @@
 
 import sqlite3
 import struct
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -425,3 +427,11 @@ def test_a_full_disk_is_told_of_with_the_bag(tmp_path, monkeypatch, name):
     with pytest.raises(InputError, match=f'{name}: cannot be written, for the disk is full'), bag:
         bag.write_depth(1, 'camera', np.ones((120, 160), np.float32), Intrinsics(150, 150, 80, 60, 160, 120))
     assert not list(tmp_path.iterdir())
+
+
+def test_a_disk_that_is_full_before_a_bag_begins_is_told_and_leaves_nothing(tmp_path):
+    command = [sys.executable, '-m', 'hand_pose_ros.cli', 'synth', 'record', str(tmp_path / 'x.db3'), '--number', '1']
+    done = subprocess.run(['bash', '-c', 'ulimit -f 4; "$@"', 'bash', *command], capture_output=True, text=True)
+    assert done.returncode == 1 and not list(tmp_path.iterdir())
+    assert done.stderr == (
+        f'hand-pose synth: {tmp_path}/x.db3: cannot be written (disk I/O error): choose another place\n')

@@ -58,7 +58,12 @@ class BagWriter:
             raise InputError(f'{self.path}: the bag cannot be written ({error.strerror}): choose another place'
                              ) from None
         self._writer = Writer(self._work / self.path.stem, version=9, storage_plugin=StoragePlugin[storage.upper()])
-        self._writer.open()
+        try:
+            with naming_full_disk(self.path):
+                self._writer.open()
+        except BaseException:
+            self.abort()
+            raise
         self._connections: dict[str, Connection] = {}
         self._types = typestore().types
 

@@ -625,6 +625,18 @@ def test_silence_names_the_topic_and_its_publishers(rig: Rig, monkeypatch: pytes
     assert sum('/somewhere/else' in text for text in rig.said()) == 1
 
 
+def test_who_has_just_come_is_not_said_to_be_missing(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(node_module, 'SILENCE_S', 0.5)
+    rig.start()
+
+    def newest() -> str:
+        return rig.received[DiagnosticArray][-1].status[0].message if rig.received[DiagnosticArray] else ''
+    rig.until(lambda: 'without any publisher' in newest(), 'the silence to be told')
+    monkeypatch.setattr(node_module, 'SILENCE_S', 60.0)
+    rig.client.create_publisher(Image, 'depth/image_rect', BEST_EFFORT)
+    rig.until(lambda: newest() == 'no images', 'the publisher to be seen')
+
+
 def test_depth_that_is_only_raw_is_found(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(node_module, 'SILENCE_S', 0.1)
     rig.client.create_publisher(Image, 'depth/image_rect', RELIABLE)

@@ -232,7 +232,7 @@ class EstimatorNode(LifecycleNode):
         listening = self._worker is not None
         published = listening and self.count_publishers(self._image_topic) > 0
         if published and not self._published:  # who has just come, as a bag that is replayed, may take its time
-            self._heard_at = time.monotonic()
+            self._heard_at, self._statistics.silence = time.monotonic(), ''
         self._published = published
         if listening and self._latched is None:
             self._latched = topics.subscribe_latched(self, CameraInfo, self._camera.topic, self._camera.update)

@@ -251,6 +251,8 @@ def test_schedules():
     original, modern = RECIPES['original-code'], RECIPES['modern']
     assert learning_rate(original, 0) == pytest.approx(0.01 / 1.2)
     assert learning_rate(original, 0.999) == pytest.approx(0.01 / (1 + 0.2 * 100))
+    for epoch in range(100):  # each begins with its first step, however steps / budget is rounded
+        assert learning_rate(original, 569 * epoch / 56_900) == pytest.approx(0.01 / (1 + 0.2 * (1 + epoch)))
     assert learning_rate(RECIPES['paper'], 0.7) == 0.01
     rates = [learning_rate(modern, progress) for progress in (0, modern.warmup, 0.5, 1)]
     assert rates[0] == 0 and rates[1] > 0.99 * modern.learning_rate and rates[3] < 1e-9

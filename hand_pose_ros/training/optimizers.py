@@ -123,5 +123,5 @@ def learning_rate(recipe: Recipe, progress: float) -> float:
     if recipe.schedule == 'constant':
         return rate
     if recipe.schedule == 'hyperbolic':
-        return rate / (1 + 0.2 * (1 + int(progress * recipe.epochs)))
+        return rate / (1 + 0.2 * (1 + int(progress * recipe.epochs + 1e-6)))
     return rate * 0.5 * (1 + math.cos(math.pi * progress))

@@ -20,6 +20,8 @@ PATCH_SIZE = 128
 MAX_SLOPE, MIN_SLOPE = 3.0, 1e-4
 """Of the rays at the border of an image against the axis of the camera (71.6 degrees, and a fraction of a minute of
 arc). Beyond them the intrinsics are those of no lens."""
+MAX_RATIO = 3.0
+"""Of the two focal lengths: pixels may be binned in one direction."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,9 @@ class Intrinsics:
                 raise InputError(f'a focal length of {focal:g} and a principal point at {center:g} pixels are those of '
                                  f'no camera of {self.width}x{self.height} pixels: calibrate it, or correct '
                                  'the intrinsics that were given')
+        if not 1 / MAX_RATIO <= self.fx / self.fy <= MAX_RATIO:
+            raise InputError(f'focal lengths of {self.fx:g} and {self.fy:g} pixels are not those of one camera: '
+                             'calibrate it, or correct the intrinsics that were given')
 
     def project(self, points: ArrayLike) -> NDArray[np.float64]:
         """Points (..., 3) in metres -> pixels (..., 2)."""

@@ -137,6 +137,9 @@ def test_intrinsics_of_no_lens_are_refused(k: list[float]) -> None:
     given_ = Params(intrinsics_fx=1e-5, intrinsics_fy=1e-5, intrinsics_cx=320.0, intrinsics_cy=240.0)
     with pytest.raises(InputError, match=r'^parameters intrinsics\.\*: .* no camera of 640x480 pixels'):
         camera.intrinsics(640, 480, given_)
+    given_ = Params(intrinsics_fx=1e5, intrinsics_fy=500.0, intrinsics_cx=320.0, intrinsics_cy=240.0)
+    with pytest.raises(InputError, match='focal lengths of 100000 and 500 pixels are not those of one camera'):
+        camera.intrinsics(640, 480, given_)
 
 
 def test_intrinsics_may_be_set_one_after_the_other() -> None:

@@ -269,16 +269,16 @@ def _names(bags: Sequence[str]) -> dict[str, str]:
 def _deliver(result: Result, others: Sequence[Result], read_depths: Callable[[Sequence[int]], dict[int, Any]] | None,
              json: str | None = None, out: str | Path | None = None, report: str | Path | None = None,
              sources: Sequence[str] = ()) -> None:
-    """Print the numbers, and write the files that were asked for; `sources` are those of the others."""
+    """Write the files that were asked for, and print the numbers; `sources` are those of the others."""
     result, *others = published.named_apart([result, *others], ['', *sources])
     for note in told_notes([result, *others]):
         print(f'NOTE: {note}', file=sys.stderr)
     summary = result.summary()
-    print_summaries([(result.name, summary), *((other.name, other.summary()) for other in others)])
-    if json:
+    if json:  # the files first, for printing may fail
         write_json(json, summary)
     if out:
         result.save(out)
+    print_summaries([(result.name, summary), *((other.name, other.summary()) for other in others)])
     if report:
         from hand_pose_ros.evaluation.report import write_report
         if any(other.skeleton != result.skeleton for other in others):

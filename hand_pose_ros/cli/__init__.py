@@ -46,6 +46,7 @@ class _Parser(argparse.ArgumentParser):
 def _ending_like_ctrl_c() -> Iterator[None]:
     """SIGTERM, too, leaves nothing half-made behind. Training and the node have handlers of their own meanwhile."""
     def stop(*_: object) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the next must not interrupt what this one begins
         raise KeyboardInterrupt
 
     try:

@@ -260,8 +260,11 @@ def _attempts(paths: Sequence[str | Path], settings: Settings, sinks: Mapping[st
 
 
 def _start_worker() -> None:
-    # It leaves no half-written bag behind; and a SystemExit, unlike a KeyboardInterrupt, leaves no traceback.
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
+    def stop(*_: object) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the next must not interrupt what this one begins
+        sys.exit(1)  # unlike a KeyboardInterrupt, it leaves no traceback
+
+    signal.signal(signal.SIGTERM, stop)  # by default it would leave half-written bags
     leave_with_parent(GRACE_S)
 
 

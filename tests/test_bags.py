@@ -1,5 +1,6 @@
 """What bags promise: three formats in, frame by frame with their camera; complete or not there at all when written."""
 
+import os
 import sqlite3
 import struct
 import subprocess
@@ -98,6 +99,19 @@ def test_stamps_may_be_those_of_an_array(tmp_path, depths, name):
             bag.write_hands(stamp, 'camera_optical', [hand(0)])
     assert_same(tmp_path / name, depths)
     assert [hands.stamp_ns for hands in read_hands(tmp_path / name)] == STAMPS
+
+
+@pytest.mark.parametrize('name', ['run#1?.db3', 'a%42.db3', os.fsdecode(b'\xff.db3'), 'run#1'])
+def test_sqlite3_takes_any_name(tmp_path, depths, name):
+    write(tmp_path / 'aB.db3', depths[::-1])  # what a%42.db3 would mean in a URI
+    assert_same(write(tmp_path / name, depths, storage='sqlite3'), depths)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([name, 'aB.db3'])
+
+
+def test_a_damaged_sqlite3_bag_is_told_by_its_name(tmp_path):
+    (tmp_path / 'a b%.db3').write_bytes(b'no database')
+    with pytest.raises(InputError, match=r'^[^%]*/a b%\.db3: the bag cannot be opened'):
+        Bag(tmp_path / 'a b%.db3')
 
 
 def test_sqlite3_folder(tmp_path, depths):

@@ -9,6 +9,7 @@ from collections.abc import Collection, Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
+from urllib.parse import quote
 
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
@@ -120,11 +121,11 @@ def _open(path: Path) -> tuple[AnyReader, bool]:
     """A reader of the bag, and whether it only sees what an interrupted recording left."""
     if not path.exists():
         raise InputError(f'{path}: there is no such bag: check the path')
-    attempts: list[Any] = [path]
+    attempts: list[Any] = [PathForSqlite(path)]
     files = [file for kind in ('mcap', 'db3') for file in path.glob(f'*.{kind}')] if path.is_dir() else [path]
     if len(files) == 1:
         if path.is_dir():
-            attempts.append(files[0])
+            attempts.append(PathForSqlite(files[0]))
         if files[0].suffix == '.mcap':
             attempts.append(_InterruptedMcap(files[0]))
     failure: Exception | None = None
@@ -140,6 +141,13 @@ def _open(path: Path) -> tuple[AnyReader, bool]:
         except Exception as error:  # errors of sqlite, YAML and of the decompressors come through as they are
             failure = failure or error
     raise InputError(f'{path}: the bag cannot be opened ({_said(failure)}); {_remedy(path)}') from failure
+
+
+class PathForSqlite(type(Path())):  # type: ignore[misc]
+    """A path as rosbags, which puts it into a URI of SQLite as it is, must be given it: %, ? and # mean more there."""
+
+    def __format__(self, _spec: str) -> str:
+        return quote(os.fsencode(self))
 
 
 def _said(error: Exception | None) -> str:

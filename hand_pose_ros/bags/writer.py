@@ -15,7 +15,17 @@ from numpy.typing import NDArray
 from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from hand_pose_ros.bags.bag import CAMERA_INFO, COMPRESSED_IMAGE, HAND, HANDS, IMAGE, SIDES, SKELETON, typestore
+from hand_pose_ros.bags.bag import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    HAND,
+    HANDS,
+    IMAGE,
+    SIDES,
+    SKELETON,
+    PathForSqlite,
+    typestore,
+)
 from hand_pose_ros.conventions import camera_info_beside, join_transport
 from hand_pose_ros.depth import encode_compressed, to_units
 from hand_pose_ros.errors import InputError
@@ -58,6 +68,7 @@ class BagWriter:
             raise InputError(f'{self.path}: the bag cannot be written ({error.strerror}): choose another place'
                              ) from None
         self._writer = Writer(self._work / self.path.stem, version=9, storage_plugin=StoragePlugin[storage.upper()])
+        self._writer.path = PathForSqlite(self._writer.path)
         try:
             with naming_full_disk(self.path):
                 self._writer.open()

@@ -1,5 +1,6 @@
 """What `hand-pose estimate` promises: every usable image answered, in files that hold what the estimator said."""
 
+import os
 import shutil
 import subprocess
 import sys
@@ -399,3 +400,13 @@ def test_what_is_read_is_not_written_over(kind, bag, folder, command, capsys):
     assert command(*output) == 1
     assert 'this is the input, which would be lost' in capsys.readouterr().err
     assert before == {path: path.read_bytes() for path in (bag, *folder.iterdir())}
+
+
+@pytest.mark.parametrize('link', [os.symlink, os.link])
+def test_pngs_behind_links_are_not_replaced_by_pictures(link, folder, tmp_path, command, capsys):
+    (tmp_path / 'chosen').mkdir()
+    link(folder / '9.png', tmp_path / 'chosen' / '9.png')
+    before = (folder / '9.png').read_bytes()
+    assert command(tmp_path / 'chosen', *INTRINSICS, '--overlay', folder) == 1
+    assert (folder / '9.png').read_bytes() == before
+    assert f'{folder}/9.png: this is the input, which would be lost' in capsys.readouterr().err

@@ -160,6 +160,8 @@ def _open(args: argparse.Namespace, stack: ExitStack) -> tuple[Iterator[DepthInp
             args.parser.error('PNGs come without a camera: give --intrinsics FX FY CX CY')
         refuse(args, ('depth_topic', 'camera_info_topic'), 'is for bags: PNGs have no topics')
         check_intrinsics(args)
+        for path in paths:  # each, for they may be links into the folder of the pictures
+            keep_input(args.overlay and args.overlay / f'{path.stem}.png', path)
         return _from_pngs(paths, args.intrinsics, args.depth_scale or 0.001), len(paths)
     bag = stack.enter_context(DepthBag(args.input, **bag_options(args)))
     return from_bag(bag), len(bag)

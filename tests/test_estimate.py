@@ -410,3 +410,16 @@ def test_pngs_behind_links_are_not_replaced_by_pictures(link, folder, tmp_path, 
     assert command(tmp_path / 'chosen', *INTRINSICS, '--overlay', folder) == 1
     assert (folder / '9.png').read_bytes() == before
     assert f'{folder}/9.png: this is the input, which would be lost' in capsys.readouterr().err
+
+
+def test_names_need_not_be_utf_8(bag, tmp_path, weights):
+    folder = tmp_path / os.fsdecode(b'\xff')
+    bag = bag.rename(tmp_path / os.fsdecode(b'\xff.mcap'))
+    for outputs in (['estimate', '--overlay', folder, '--out', folder / 'joints.npz'],
+                    ['evaluate', '--report', folder / 'report']):
+        done = subprocess.run([sys.executable, '-m', 'hand_pose_ros.cli', outputs[0], bag, *outputs[1:], '--model',
+                               weights, '--min-score', '0'], capture_output=True, text=True,
+                              env=os.environ | {'PYTHONIOENCODING': 'utf-8:strict'})
+        assert done.returncode == 0, done.stderr
+        assert '\\udcff' in done.stdout
+    assert (folder / '000000.png').is_file() and (folder / 'report' / 'report.html').is_file()

@@ -31,7 +31,7 @@ from hand_pose_ros.cli.arguments import (
 from hand_pose_ros.cli.hand_bag import HandBag
 from hand_pose_ros.depth import depth_problem, read_png
 from hand_pose_ros.drawing import overlay
-from hand_pose_ros.errors import HandPoseError, InputError
+from hand_pose_ros.errors import InputError
 from hand_pose_ros.files import check_writable, in_one_step
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.hand import HandEstimate
@@ -209,8 +209,8 @@ class _Overlays:
     def add(self, image: DepthInput, depth: NDArray[np.float32], intrinsics: Intrinsics,
             hands: Sequence[HandEstimate]) -> None:
         path = self._folder / f'{image.name}.png'
-        if not cv2.imwrite(str(path), overlay(depth, intrinsics, hands, self._skeleton)):
-            raise HandPoseError(f'{path}: the picture cannot be written: choose another --overlay folder')
+        picture = cv2.imencode('.png', overlay(depth, intrinsics, hands, self._skeleton))[1]
+        path.write_bytes(picture.tobytes())  # OpenCV itself crashes at names that are not UTF-8
 
     def finish(self) -> None:
         pass

@@ -89,7 +89,7 @@ def write_report(results: Sequence[Result], folder: str | Path, read_depths: Rea
             'colors': ['rgb({},{},{})'.format(*FINGER_COLORS[finger]) for finger in result.skeleton.fingers]}),
         subtitle=f'{summary["frames_total"]} frames, {result.skeleton.name}, hand_pose_ros {__version__}')
     path = folder / 'report.html'
-    write_bytes(path, html.encode())
+    write_bytes(path, html.encode(errors='replace'))  # names of files may hold what is not UTF-8
     return path
 
 

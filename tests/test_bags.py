@@ -342,6 +342,20 @@ def test_message_types_are_those_ros_would_hash(tmp_path):
         assert fields == list(getattr(messages, name).get_fields_and_field_types())
 
 
+def test_a_bag_behind_a_link_is_written_where_that_leads(tmp_path, depths):
+    (tmp_path / 'disk').mkdir()
+    (tmp_path / 'bag.mcap').symlink_to(tmp_path / 'disk' / 'other.mcap')
+    assert_same(write(tmp_path / 'bag.mcap', depths), depths)
+    assert (tmp_path / 'bag.mcap').is_symlink() and (tmp_path / 'disk' / 'other.mcap').is_file()
+
+
+def test_a_fifo_is_not_replaced_by_a_bag(tmp_path):
+    os.mkfifo(tmp_path / 'bag.mcap')
+    with pytest.raises(InputError, match=r'bag\.mcap: there is something already'):
+        BagWriter(tmp_path / 'bag.mcap')
+    assert (tmp_path / 'bag.mcap').is_fifo()
+
+
 def test_a_folder_where_a_bag_of_one_file_is_to_be_is_refused_at_once(tmp_path):
     (tmp_path / 'bag.mcap').mkdir()
     with pytest.raises(InputError, match='there is something already'), BagWriter(tmp_path / 'bag.mcap'):

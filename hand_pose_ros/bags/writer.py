@@ -59,11 +59,12 @@ class BagWriter:
             storage = 'mcap' if self.path.suffix == '.mcap' else 'sqlite3'
         if storage not in ('mcap', 'sqlite3'):
             raise InputError(f"{self.path}: unknown storage '{storage}': choose mcap or sqlite3")
-        if self.path.is_dir() or (self.path.exists() and not self._is_file):
+        if self.path.exists() and not (self._is_file and self.path.is_file()):
             raise InputError(f'{self.path}: there is something already: give another name for the bag, or remove it')
+        self._target = Path(os.path.realpath(self.path))  # a link stays one
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._work = Path(tempfile.mkdtemp(prefix=f'.{self.path.name}.', dir=self.path.parent))
+            self._target.parent.mkdir(parents=True, exist_ok=True)
+            self._work = Path(tempfile.mkdtemp(prefix=f'.{self.path.name}.', dir=self._target.parent))
         except OSError as error:
             raise InputError(f'{self.path}: the bag cannot be written ({error.strerror}): choose another place'
                              ) from None
@@ -157,7 +158,7 @@ class BagWriter:
         try:
             with naming_full_disk(self.path):
                 self._writer.close()
-            os.replace(next(made.glob(f'*{self.path.suffix}')) if self._is_file else made, self.path)
+            os.replace(next(made.glob(f'*{self.path.suffix}')) if self._is_file else made, self._target)
         finally:
             shutil.rmtree(self._work, ignore_errors=True)
 

@@ -399,6 +399,15 @@ def test_a_parameter_that_there_is_not_is_named(rig: Rig) -> None:
     rig.until_said("no parameter 'max_depht'", 'no effect')
 
 
+@pytest.mark.parametrize('arguments', [('estimator',), ('replay', 'demo/hand.mcap'),
+                                       ('evaluate', 'demo/hand.mcap', '--via-ros')])
+def test_a_log_of_ros_that_cannot_be_written_is_told_with_the_remedy(arguments: tuple[str, ...]) -> None:
+    done = subprocess.run([*COMMAND, *arguments], capture_output=True, text=True, cwd=Path(__file__).parents[1],
+                          env=os.environ | {'ROS_LOG_DIR': '/proc/log'})
+    assert done.returncode == 1 and 'Traceback' not in done.stderr
+    assert f'hand-pose {arguments[0]}: ROS cannot write its log' in done.stderr and 'ROS_LOG_DIR' in done.stderr
+
+
 @pytest.mark.parametrize('arguments', [('--params-file', '/nowhere.yaml'), ('-r', 'depth/image_rect')])
 def test_arguments_that_ros_cannot_read_are_one_sentence(arguments: tuple[str, ...]) -> None:
     done = subprocess.run([*COMMAND, 'estimator', '--ros-args', *arguments], capture_output=True, text=True)

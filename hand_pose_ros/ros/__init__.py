@@ -23,10 +23,13 @@ def init(args: list[str] | None = None, **options: Any) -> None:
     """rclpy.init, whose arguments may be wrong.
 
     Raises:
-        HandPoseError: the arguments of ROS cannot be used.
+        HandPoseError: the arguments of ROS cannot be used, or its log cannot be written.
     """
     try:
         rclpy.init(args=args, **options)
     except RuntimeError as error:  # RCLError, which rclpy keeps to itself
         reason = re.sub(r', at /\S+:\d+', '', str(error).splitlines()[0])  # of the file in C
+        if 'log directory' in reason:
+            raise HandPoseError(f'ROS cannot write its log ({reason}): set the environment variable ROS_LOG_DIR to a '
+                                'folder that can be written') from error
         raise HandPoseError(f'the arguments of ROS cannot be used: {reason}') from error

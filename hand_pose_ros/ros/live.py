@@ -26,7 +26,7 @@ from hand_pose_ros.bags import DepthBag
 from hand_pose_ros.conventions import camera_info_beside, split_transport, stamp_ns
 from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.msg import HandJointsArray, HandSkeleton
-from hand_pose_ros.ros import qos
+from hand_pose_ros.ros import init, qos
 from hand_pose_ros.ros.replay import Replay
 from hand_pose_ros.ros.topics import CAMERA_INFO, IMAGE
 
@@ -84,7 +84,7 @@ def play_through_node(bag: DepthBag, camera_info_topic: str | None = None,
     arguments += [item for name, topic in remappings.items() for item in ('-r', f'{name}:={topic}')]
     if ours := not rclpy.ok():
         qos.let_large_images_through()
-        rclpy.init()
+        init()
     try:
         with _listening(namespace, bag.depth_topic, Image if transport == 'raw' else CompressedImage) as listener, \
                 _running(arguments) as process:

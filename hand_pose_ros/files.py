@@ -25,7 +25,7 @@ def in_one_step(path: str | Path) -> Iterator[Path]:
     if _takes_files(path):
         yield Path(path)
         return
-    path = Path(path).resolve()
+    path = Path(os.path.realpath(path))  # resolve() raises RuntimeError at a link that leads to itself
     part = _begin(path)
     mode = part.stat().st_mode
     try:
@@ -55,7 +55,7 @@ def naming_full_disk(path: str | Path) -> Iterator[None]:
 def check_writable(path: str | Path) -> None:
     """Raise InputError if there can be no such file: before the work whose result it is to hold."""
     if not _takes_files(path):
-        _begin(Path(path).resolve()).unlink()
+        _begin(Path(os.path.realpath(path))).unlink()
 
 
 def _takes_files(path: str | Path) -> bool:

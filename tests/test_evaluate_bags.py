@@ -18,6 +18,7 @@ import torch
 
 from hand_pose_ros.bags import Bag, BagWriter, DepthBag, read_hands
 from hand_pose_ros.cli import main
+from hand_pose_ros.cli.arguments import keep_input
 from hand_pose_ros.cli.evaluate import _names
 from hand_pose_ros.cli.hand_bag import HandBag
 from hand_pose_ros.errors import InputError
@@ -25,7 +26,7 @@ from hand_pose_ros.estimator import HandEstimate, HandPoseEstimator
 from hand_pose_ros.evaluation import bag_evaluation
 from hand_pose_ros.evaluation.bag_evaluation import Settings, evaluate_bag, evaluate_bags
 from hand_pose_ros.evaluation.results import Result
-from hand_pose_ros.files import in_one_step
+from hand_pose_ros.files import check_writable, in_one_step, write_json
 from hand_pose_ros.geometry import Cube, Intrinsics
 from hand_pose_ros.models import build
 from hand_pose_ros.models.checkpoints import save_checkpoint
@@ -420,3 +421,11 @@ def test_a_folder_where_a_file_is_to_be_is_refused(tmp_path):
     with pytest.raises(InputError, match='is a folder'), in_one_step(tmp_path):
         pass
     assert not list(tmp_path.parent.glob('.*.part'))
+
+
+def test_a_link_that_leads_to_itself_is_replaced(tmp_path):
+    (tmp_path / 'loop').symlink_to('loop')
+    keep_input(tmp_path / 'loop', tmp_path)
+    check_writable(tmp_path / 'loop')
+    write_json(tmp_path / 'loop', {})
+    assert (tmp_path / 'loop').read_text() == '{}\n'

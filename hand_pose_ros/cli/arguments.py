@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -58,7 +59,7 @@ def keep_input(output: str | Path | None, source: str | Path | None) -> None:
     """
     if not (output and source and Path(source).exists()):
         return
-    inside = Path(source).resolve() == Path(output).resolve().parent
+    inside = os.path.realpath(source) == os.path.dirname(os.path.realpath(output))
     same = Path(output).exists() and Path(output).samefile(source)
     if same or (inside and Path(output).suffix in ('.mcap', '.db3', '.yaml')):
         raise HandPoseError(f'{output}: this is the input, which would be lost: choose another place')

@@ -359,6 +359,18 @@ def test_shards_are_the_same_wherever_they_are_made_and_mended_when_damaged(tmp_
     assert not list((tmp_path / 'cache').rglob('*.tmp'))
 
 
+def test_what_a_killed_process_left_of_a_shard_goes_when_that_is_made(tmp_path):
+    write_icvl(tmp_path / 'icvl', np.random.default_rng(5))
+    disk = DiskShards(partial(open_dataset, 'icvl', 'test', tmp_path / 'icvl'), tmp_path / 'cache', 2)
+    left = disk.path(0).with_name(f'.{disk.path(0).name}.1234567.part')
+    left.write_bytes(b'half of it')
+    try:
+        disk.read(0)
+    finally:
+        disk.close()
+    assert not left.exists()
+
+
 def test_a_missing_frame_stops_the_making_of_its_shard(tmp_path):
     write_icvl(tmp_path / 'icvl', np.random.default_rng(5))
     opening = partial(open_dataset, 'icvl', 'test', tmp_path / 'icvl')

@@ -201,6 +201,8 @@ def _make_file(shard: int, path: Path) -> None:
     with FileLock(path.with_suffix('.lock')):
         if path.exists():
             return
+        for left in path.parent.glob(f'.{path.name}.*.part'):  # by a process that was killed, which held the lock
+            left.unlink(missing_ok=True)
         tensors = {key: value.cpu().contiguous() for key, value in make_shard(dataset, shard, shard_size).items()}
         with in_one_step(path) as part:
             save_file(tensors, part, metadata={'sha256': _checksum(tensors)})

@@ -494,6 +494,15 @@ def test_a_signal_does_not_wait_for_samples_and_the_run_continues_bit_for_bit(fo
     assert same_state(tmp_path / 'whole', tmp_path / 'stopped')
 
 
+def test_what_a_killed_run_left_half_written_goes_with_the_next(tmp_path):
+    left = tmp_path / '.state.safetensors.1234567.part'
+    left.write_bytes(b'half of it')
+    run = RunFolder(tmp_path)
+    run.lock()
+    run.close()
+    assert not left.exists()
+
+
 def test_one_folder_is_trained_in_by_one_process_at_a_time(folder, tmp_path):
     first = tiny(folder, 'samples=8', out=tmp_path / 'run')
     first.folder.lock()

@@ -71,6 +71,8 @@ class RunFolder:
         except Timeout:
             raise TrainingError(f'{self.path}: another process trains in this folder: wait for its end, or choose '
                                 'another --out') from None
+        for left in self.path.glob('.*.safetensors.*.part'):  # by a process that was killed, which held the lock
+            left.unlink(missing_ok=True)
 
     def create(self, recipe: Recipe) -> None:
         """Start a new run here.

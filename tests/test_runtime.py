@@ -16,7 +16,7 @@ from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.models import build
 from hand_pose_ros.models.checkpoints import load_checkpoint
 from hand_pose_ros.models.dense import HandDense
-from hand_pose_ros.runtime import default_threads, make_engine
+from hand_pose_ros.runtime import cuda_engine, default_threads, make_engine
 from hand_pose_ros.runtime.cuda_engine import LARGEST, CudaEngine, _Captured
 from hand_pose_ros.runtime.engine import Pipeline, TorchEngine
 from hand_pose_ros.runtime.fused import fuse
@@ -333,6 +333,16 @@ def test_weights_that_ship_are_as_good_in_half_precision(name):
     assert moved_mm.mean() < 0.1
     # A view of the second look that is rounded another way is another view, and may tell another millimetre.
     assert (moved_mm.max(axis=1) < 0.5).mean() > 0.95
+
+
+@pytest.mark.parametrize('name', ['deep_prior', 'deep_prior_orref', 'hand_dense'])
+def test_rounding_alone_is_not_taken_for_an_engine_that_is_wrong(name, monkeypatch):
+    checkpoint = load_checkpoint(name)
+    pipeline = Pipeline(checkpoint.network, checkpoint.refiner).requires_grad_(False).eval()
+    halved = copy.deepcopy(pipeline)
+    fuse(halved.network)
+    monkeypatch.setattr(cuda_engine, 'ROUNDING', cuda_engine.ROUNDING / 2)
+    assert cuda_engine._agree(TorchEngine(halved.reduce_precision()), TorchEngine(pipeline))
 
 
 def test_fused_layers_give_what_the_layers_give():

@@ -12,6 +12,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 from xml.etree import ElementTree
@@ -128,10 +129,8 @@ def _ros() -> Findings:
             yield 'note', ('none: the node, replay and demo need it, all else works; source its setup file, or in the '
                            "checkout: pip install '.[ros]'")
         return
-    settings = [f'{name}={os.environ[name]}' for name in (
-        'RMW_IMPLEMENTATION', 'ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'ROS_LOCALHOST_ONLY')
-        if name in os.environ]
-    if failure := _ros_failure():
+    settings = _ros_settings()
+    if failure := _ros_failure(settings):
         remedy = f'; correct or unset {", ".join(settings)}' if settings else ''
         yield 'WRONG', f'no node can be started: {failure}{remedy}'
         return
@@ -139,8 +138,16 @@ def _ros() -> Findings:
     yield 'ok', ', '.join([distro or 'from wheels', middleware(), 'messages built', *settings])
 
 
-def _ros_failure() -> str:
-    """Why no node can be started, empty if one can. It is tried in a process of its own, which ROS may end."""
+def _ros_settings() -> tuple[str, ...]:
+    """What the environment says to ROS, as NAME=value."""
+    return tuple(f'{name}={os.environ[name]}' for name in (
+        'RMW_IMPLEMENTATION', 'ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'ROS_LOCALHOST_ONLY')
+        if name in os.environ)
+
+
+@lru_cache(maxsize=1)
+def _ros_failure(_settings: tuple[str, ...]) -> str:
+    """Why no node can be started with these settings, empty if one can; tried in a process, which ROS may end."""
     code = ('import sys\nfrom hand_pose_ros.errors import HandPoseError\ntry:\n    from hand_pose_ros import ros\n'
             '    import rclpy\n    ros.init()\n    rclpy.create_node("doctor")\n'
             'except HandPoseError as error:\n    sys.exit(str(error))')
@@ -150,7 +157,7 @@ def _ros_failure() -> str:
 
 
 def _dds_profile() -> Findings:
-    if importlib.util.find_spec('rclpy') is None or _ros_failure():
+    if importlib.util.find_spec('rclpy') is None or _ros_failure(_ros_settings()):
         return
     from hand_pose_ros.ros.qos import PROFILE_VARIABLES, large_image_profile, middleware
 

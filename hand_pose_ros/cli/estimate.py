@@ -32,7 +32,7 @@ from hand_pose_ros.cli.hand_bag import HandBag
 from hand_pose_ros.depth import depth_problem, read_png
 from hand_pose_ros.drawing import overlay
 from hand_pose_ros.errors import InputError
-from hand_pose_ros.files import check_writable, in_one_step
+from hand_pose_ros.files import check_writable, in_one_step, write_bytes
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.hand import HandEstimate
 from hand_pose_ros.skeleton import Skeleton
@@ -210,7 +210,7 @@ class _Overlays:
             hands: Sequence[HandEstimate]) -> None:
         path = self._folder / f'{image.name}.png'
         picture = cv2.imencode('.png', overlay(depth, intrinsics, hands, self._skeleton))[1]
-        path.write_bytes(picture.tobytes())  # OpenCV itself crashes at names that are not UTF-8
+        write_bytes(path, picture.tobytes())  # OpenCV itself crashes at names that are not UTF-8
 
     def finish(self) -> None:
         pass

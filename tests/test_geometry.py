@@ -65,15 +65,17 @@ def test_a_patch_is_within_minus_one_and_one_whatever_the_depth(cube, seed):
 
 @pytest.mark.parametrize(('reading', 'value'), [
     (0.0, 1.0), (np.nan, 1.0), (-0.5, 1.0),     # no reading
-    (0.8, 1.0),     # behind the back face
+    (0.8, 1.0), (3e38, 1.0),    # behind the back face
     (0.65, 1.0),    # on the back face
     (0.575, 0.5), (0.5, 0.0), (0.425, -0.5),
     (0.2, -1.0),    # before the front face
 ])
 def test_what_a_patch_shows_of_a_plane(reading, value):
     depth = np.full((480, 640), reading, np.float32)
-    patch = crop(depth, Cube((0, 0, 0.5), 0.3), VGA)
+    with np.errstate(over='raise'):
+        patch = crop(depth, Cube((0, 0, 0.5), 0.3), VGA)
     assert np.allclose(patch, value, atol=1e-6)
+    assert 0 < reading < 0.66 or (patch == 1).all()  # exactly: what is less is seen
 
 
 @pytest.mark.parametrize('kind', ['f8', '>f4'])
@@ -84,10 +86,19 @@ def test_a_patch_is_the_same_of_any_type_of_depth(kind):
 
 
 def test_outside_the_image_is_background():
-    depth = np.full((480, 640), 0.5, np.float32)
-    x = (0 - 320) / 588.03 * 0.5
-    patch = crop(depth, Cube((x, 0, 0.5), 0.3), VGA)[0]
+    depth = np.ones((480, 640), np.float32)
+    patch = crop(depth, Cube(((0 - 320) / 588.03, 0, 1.0), 0.3), VGA)[0]
     assert (patch[:, :63] == 1).all() and (patch[:, 65:] == 0).all()
+
+
+@pytest.mark.parametrize('axis', [0, 1], ids=['rows', 'columns'])
+def test_a_pixel_of_a_patch_is_the_reading_nearest_to_its_middle(axis):
+    camera, cube = Intrinsics(600.0, 400.0, 310.0, 250.0, 640, 480), Cube((0.02, -0.03, 0.5), 0.25)
+    depth = (0.46 + 1e-4 * np.indices((480, 640))[axis]).astype(np.float32)  # tells where it was read
+    read = (0.5 + 0.125 * crop(depth, cube, camera)[0].astype(np.float64) - 0.46) / 1e-4
+    row, column = (np.indices((128, 128)) + 0.5) / 64 - 1
+    at = camera.project(cube.from_cube(np.stack([column, row, np.zeros_like(row)], axis=-1)))[..., 1 - axis]
+    assert np.abs(read - read.round()).max() < 0.05 and np.abs(read - at).max() < 0.6
 
 
 def test_a_patch_shows_a_joint_where_cube_units_say():
@@ -111,11 +122,13 @@ def test_raw_and_rectified_intrinsics():
 
 def test_binning_and_region_of_interest():
     roi = SimpleNamespace(x_offset=100, y_offset=40, width=400, height=200)
-    assert (Intrinsics.from_camera_info(camera_info(roi=roi, binning_x=2, binning_y=2))
-            == Intrinsics(250, 255, 110, 100, 200, 100))
+    assert (Intrinsics.from_camera_info(camera_info(roi=roi, binning_x=2, binning_y=4))
+            == Intrinsics(250, 127.5, 110, 50, 200, 50))
 
 
-@pytest.mark.parametrize('changes', [{'k': [0.0] * 9}, {'width': 0}, {'k': [float('nan')] * 9}, {'k': [-1.0] * 9}])
+@pytest.mark.parametrize('changes', [
+    {'k': [0.0] * 9}, {'width': 0}, {'height': 0}, {'k': [float('nan')] * 9}, {'k': [-1.0] * 9},
+    {'k': [500.0, 0, 320, 0, -510, 240, 0, 0, 1]}])
 def test_unusable_camera_info_is_refused(changes):
     with pytest.raises(InputError, match='camera'):
         Intrinsics.from_camera_info(camera_info(**changes))
@@ -124,6 +137,22 @@ def test_unusable_camera_info_is_refused(changes):
 def test_intrinsics_of_another_image_are_refused():
     with pytest.raises(InputError, match=r'320x240.*640x480'):
         VGA.check_size(320, 240)
+    with pytest.raises(InputError, match=r'640x240.*640x480'):
+        VGA.check_size(640, 240)
+
+
+@pytest.mark.parametrize(('fx', 'fy', 'cx', 'cy', 'wrong'), [
+    (200, 200, 320, 240, None), (1000, 400, 320, 240, None),
+    (500, 500, 1600, 240, 'of 500 .* at 1600'), (500, 500, -900, 240, 'of 500 .* at -900'),
+    (900, 310, 320, 1000, 'of 310 .* at 1000'), (9e6, 9e6, 320, 240, 'of 9e.06 .* at 320'),
+    (1300, 400, 320, 240, 'lengths of 1300 and 400'), (400, 1300, 320, 240, 'lengths of 400 and 1300')])
+def test_only_what_a_lens_can_see_is_computed_with(fx, fy, cx, cy, wrong):
+    camera = Intrinsics(fx, fy, cx, cy, 640, 480)
+    if wrong is None:
+        camera.check_lens()
+    else:
+        with pytest.raises(InputError, match=wrong):
+            camera.check_lens()
 
 
 @pytest.mark.parametrize(('center', 'side'), [

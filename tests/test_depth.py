@@ -58,9 +58,12 @@ def test_sixteen_bits_are_units_of_depth_scale(units, encoding, padding, big):
 
 
 @pytest.mark.parametrize('buffer', [bytes, bytearray, memoryview, lambda b: array.array('B', b),
-                                    lambda b: np.frombuffer(b, np.uint8)])
+                                    lambda b: np.frombuffer(b, np.uint8), lambda b: np.frombuffer(b, np.uint16)])
 def test_data_can_be_any_buffer(units, buffer):
     np.testing.assert_array_equal(decode_image(image(units, buffer=buffer)), decode_image(image(units)))
+    form, data = encode_compressed(units * np.float32(0.001), 'rvl')
+    np.testing.assert_array_equal(decode_compressed(SimpleNamespace(format=form, data=buffer(data))),
+                                  decode_image(image(units)))
 
 
 @pytest.mark.parametrize('padding', [0, 3, 8])
@@ -117,8 +120,9 @@ def test_compressed_depth_png_in_all_spellings(units, form):
 
 @pytest.mark.parametrize('form', ['16UC1; png compressed ', '16UC1; png compressed', '16UC1'])
 def test_png_without_header(units, form):
-    depth = decode_compressed(compressed(form, encode_png(units), b''))
-    np.testing.assert_array_equal(depth, decode_image(image(units)))
+    for behind in (b'', b'\xff' * 9):
+        depth = decode_compressed(compressed(form, encode_png(units) + behind, b''))
+        np.testing.assert_array_equal(depth, decode_image(image(units)))
 
 
 def test_other_codecs_are_refused():
@@ -150,6 +154,8 @@ def test_inverse_depth_of_32fc1(encode):
     near = (depth > 0) & (depth < 2)
     assert np.abs(decoded - depth)[near].max() < 3e-4
     assert np.abs(decoded - depth).max() < 5e-3
+    message = compressed(message.format, encode(np.array([[1, 5, 7]], np.uint16)), struct.pack('<iff', 0, 10, 5))
+    assert decode_compressed(message).tolist() == [[0, 0, 5]]  # behind infinity and at it there is no reading
 
 
 @pytest.mark.parametrize(('message', 'says'), [
@@ -157,14 +163,21 @@ def test_inverse_depth_of_32fc1(encode):
     (compressed('', b''), "format ''"),
     (compressed('16UC1; compressedDepth png', b''), 'not a PNG'),
     (compressed('16UC1; compressedDepth png', b'', b''), 'not a PNG'),
+    (compressed('16UC1; compressedDepth png', encode_png(np.ones((4, 4), np.uint16))[:20]), 'not a PNG'),
     (compressed('16UC1; compressedDepth rvl', b'\1\0'), 'RVL'),
     (compressed('16UC1; compressedDepth rvl', struct.pack('<II', 1 << 31, 1 << 31)), 'claims'),
+    (compressed('16UC1; compressedDepth rvl', struct.pack('<II', 1 << 13, 1 + (1 << 11))), 'claims 8192x2049'),
     (compressed('16UC1; compressedDepth rvl', struct.pack('<II', 0, 5)), 'claims 0x5'),
+    (compressed('16UC1; compressedDepth rvl', struct.pack('<IIIII', 1, 1, *[0x88888888] * 2, 0)), 'without end'),
+    (compressed('16UC1; compressedDepth rvl', struct.pack('<III', 1, 1, 0x01100000)), 'of more than 16 bits'),  # -1
+    (compressed('16UC1; compressedDepth rvl', struct.pack('<III', 1, 1, 0x01888884)), 'of more than 16 bits'),  # 65536
     (compressed('16UC1; compressedDepth rvl', struct.pack('<II', 9, 9)), 'RVL'),
     (compressed('16UC1; compressedDepth rvl', struct.pack('<II', 9, 9) + b'\xff' * 40), 'RVL'),
     (compressed('16UC1; compressedDepth png', cv2.imencode('.png', np.zeros((4, 4), np.uint8))[1].tobytes()), '8 bits'),
     (compressed('16UC1; compressedDepth png', encode_png(np.zeros((4, 4, 3), np.uint16))), '16 bits per colour'),
     (compressed('32FC1; compressedDepth png', encode_png(np.ones((4, 4), np.uint16))), 'A=0.0'),
+    (compressed('32FC1; compressedDepth png', encode_png(np.ones((4, 4), np.uint16)),
+                struct.pack('<iff', 0, 100, float('nan'))), 'A=100.0, B=nan'),
     (compressed('32FC1; compressedDepth png', encode_png(np.ones((4, 4), np.uint16)), b''), 'header'),
 ])
 def test_bad_compressed_messages_are_refused_in_one_sentence(message, says):
@@ -248,6 +261,8 @@ def test_png_files(tmp_path, units):
         read_png(path)
     with pytest.raises(InputError, match=r'missing\.png: .*cannot be read'):
         read_png(tmp_path / 'missing.png')
+    with pytest.raises(InputError, match='cannot be read'):
+        read_png(tmp_path)
 
 
 def test_real_frames(shared_data):

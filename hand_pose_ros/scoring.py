@@ -65,16 +65,14 @@ def _explained(surface: NDArray[np.float32], joints: NDArray[np.floating], half:
     """Share of the visible surface within reach of a bone, not counting the forearm."""
     some = surface[::2, ::2]  # every other row and column will do
     rows, columns = (2 * index for index in np.nonzero((some < 1) & (some > -1)))
-    if len(rows) == 0:
-        return 0.0
     scale = 2 / surface.shape[0]
     points = np.stack([(columns + 0.5) * scale - 1, (rows + 0.5) * scale - 1, surface[rows, columns]], dtype=np.float32)
     joints = joints.astype(np.float32)
     if {'wrist', 'middle_mcp'} <= set(skeleton.joint_names):
         wrist, knuckle = (joints[skeleton.joint_names.index(name)] for name in ('wrist', 'middle_mcp'))
         points = points[:, (knuckle - wrist) @ points > (knuckle - wrist) @ wrist]
-        if points.shape[1] == 0:
-            return 0.0
+    if points.shape[1] == 0:
+        return 0.0
     parents, children = np.array(skeleton.bones).T
     start, bone = joints[parents], joints[children] - joints[parents]
     # |p - (a + t b)|^2 over all bones and points, with t clamped to the bone, from dot products only.

@@ -399,6 +399,9 @@ def test_the_second_look_sees_every_hand_upright_in_the_middle_and_equally_large
     torch.testing.assert_close(view.back(seen), joints, atol=1e-6, rtol=0)
     with torch.autocast('cpu', torch.bfloat16):  # the truth of training is not rounded
         assert torch.equal(view.into(joints), seen)
+    # What is told of the size counts up to a factor of 1.5.
+    for told, limit in ((9.0, 0.4), (-9.0, -0.4)):
+        assert network.upright(joints, torch.full((6,), told)).scale.div(0.95).log().sub(limit).abs().max() < 0.01
     # One that points at the camera, and one of which nothing is known, are seen somehow.
     assert all(part.isfinite().all() for part in network.upright(torch.zeros(1, 21, 3), torch.zeros(1)))
 
@@ -418,6 +421,9 @@ def test_readings_are_seen_where_points_are_seen():
         assert abs(rows.float().mean() - (y + 1) * 64 + 0.5) < 0.6
         torch.testing.assert_close(seen[i, 0, rows, columns], torch.full((len(rows),), z))
         assert (seen[torch.arange(6) != i] == 1).all()
+    # To the pixel: upside down, all are there.
+    noise = torch.rand(1, 1, 128, 128)
+    assert torch.equal(View(torch.zeros(1, 3), -torch.eye(2)[None], torch.ones(1)).patch(noise), noise.flip(2, 3))
     # What lies beyond the patch is background, and so is what lies behind the back of the view.
     aside = View(torch.tensor([[0.9, 0.0, 0.0]]), torch.eye(2)[None], torch.ones(1))
     assert (aside.patch(torch.zeros(1, 1, 128, 128))[..., 72:] == 1).all()
@@ -447,6 +453,8 @@ def test_two_looks_say_everything_of_the_patch_as_it_is():
     answer['joints'].sum().backward()
     assert {name.split('.')[0] for name, p in network.named_parameters() if p.grad is not None} == {'second'}
     assert not network.train().first.training and network.second.training
+    assert not any(weight.requires_grad for weight in network.first.parameters())
+    assert build('two_looks', width=8, first={'width': 4}).first.width == 4
 
 
 def test_a_hand_without_these_joints_has_no_upright():

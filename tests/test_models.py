@@ -300,8 +300,11 @@ def test_the_refiner_follows_the_hand(architecture):
 @pytest.mark.parametrize('architecture', REFINERS)
 def test_each_joint_of_the_refiner_learns_from_its_own_error_only(architecture):
     refiner = build(architecture)
-    answer = refiner(hand_patches(2), torch.zeros(2, 21, 3).requires_grad_())
+    patches, estimates = hand_patches(2), torch.zeros(2, 21, 3).requires_grad_()
+    answer = refiner(patches, estimates)
+    assert (answer != refiner(patches, estimates)).any()  # dropout
     answer[:, 3].square().sum().backward()
+    assert estimates.grad is None  # where it looks is taken as given
     learns = refiner.weights[-1].grad.abs().sum(dim=(1, 2)) > 0
     assert learns.tolist() == [j == 3 for j in range(21)]
 

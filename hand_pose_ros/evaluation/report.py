@@ -61,17 +61,18 @@ def write_report(results: Sequence[Result], folder: str | Path, read_depths: Rea
     """
     result, folder, notes = results[0], Path(folder), told_notes(results)
     summary = result.summary()
-    figures = _figures([r for r in results if r.truth is not None], result)
+    scored = [r for r in results if r.truth is not None]
+    figures = _figures(scored, result)
     for name, figure in figures.items():
         plots.save(figure, folder / name)
     cards = _cards(result, read_depths)
     sections = [
         _section('Notes', ''.join(f'<p>{escape(note)}</p>' for note in notes), 'notes') if notes else '',
         _tiles(summary),
-        _section('Accuracy', _accuracy(results)) if result.truth is not None else '',
+        _section('Accuracy', _accuracy(scored)) if result.truth is not None else '',
         *(_section(title, _image(figures[name], title) + extra) for name, title, extra in (
             ('curves', 'How many frames and joints are within a distance', _published(result)),
-            ('joints', 'Which joints are hard', _fingers(results)),
+            ('joints', 'Which joints are hard', _fingers(scored)),
             ('errors', 'When it errs', ''),
             ('latency', 'What a frame costs', _latency(summary))) if name in figures),
         _section('Frames', '<p class="soft">On the depth image: the estimate and, where it is known, the truth. In 3D '
@@ -133,17 +134,15 @@ def _cards(result: Result, read_depths: ReadDepths | None) -> list[_Card]:
 def _interesting_frames(result: Result) -> list[tuple[str, int]]:
     """Best, median and worst frame; without truth the first, middle and last that has a hand."""
     means = metrics.frame_means_mm(result.errors_mm)
-    if np.isfinite(means).any():
-        order = [int(row) for row in np.argsort(means) if np.isfinite(means[row])]
-        names = ('Best', 'Median', 'Worst')
-        tails = [f', {means[row]:.1f} mm' for row in (order[0], order[len(order) // 2], order[-1])]
-    else:
-        order = np.flatnonzero(np.isfinite(result.predictions).all((1, 2))).tolist()
-        names, tails = ('First', 'Middle', 'Last'), [''] * 3
-    if not order:
+    scored = np.isfinite(means)
+    names, order = ('Best', 'Median', 'Worst'), np.argsort(means)[:scored.sum()]  # what is not finite is last
+    if not len(order):
+        names, order = ('First', 'Middle', 'Last'), np.flatnonzero(np.isfinite(result.predictions).all((1, 2)))
+    if not len(order):
         return []
-    rows = (order[0], order[len(order) // 2], order[-1])
-    shown = {row: f'{name}: frame {row + 1}{tail}' for name, row, tail in zip(names, rows, tails, strict=True)}
+    rows = order[[0, len(order) // 2, -1]].tolist()
+    shown = {row: f'{name}: frame {row + 1}' + (f', {means[row]:.1f} mm' if scored[row] else '')
+             for name, row in zip(names, rows, strict=True)}
     return [(title, row) for row, title in shown.items()]
 
 
@@ -193,13 +192,11 @@ def _tiles(summary: dict[str, Any]) -> str:
         for label, value in tiles if value != '-') + '</div>'
 
 
-def _accuracy(results: Sequence[Result]) -> str:
-    return _table(('', *ACCURACY_COLUMNS), [
-        row for result in results if result.truth is not None for row in accuracy_rows(result.name, result.summary())])
+def _accuracy(scored: Sequence[Result]) -> str:
+    return _table(('', *ACCURACY_COLUMNS), [row for r in scored for row in accuracy_rows(r.name, r.summary())])
 
 
-def _fingers(results: Sequence[Result]) -> str:
-    scored = [r for r in results if r.truth is not None]
+def _fingers(scored: Sequence[Result]) -> str:
     rows = [(r.name, *(number(v, 1) for v in metrics.per_finger_mm(r.errors_mm, r.skeleton).values())) for r in scored]
     return _table(('mean error, mm', *FINGERS, 'palm'), rows)
 

@@ -62,7 +62,7 @@ class _Track:
     """A hand that was seen in the last image."""
 
     id: str
-    center: tuple[float, float, float]
+    center: NDArray[np.float64]
     rightness: float = 0.0  # > 0: has looked more like a right hand
     sizes: float = 0.0  # sum of logarithms of its size over the usual one
     images: int = 0
@@ -82,8 +82,8 @@ class _Reading:
     joints: NDArray[np.float64]
     confidence: NDArray[np.float32]
     score: float
-    rightness: float = 0.0
-    size: float = 0.0  # logarithm of the hand's over the usual one
+    rightness: float
+    size: float  # logarithm of the hand's over the usual one
 
 
 @dataclass
@@ -208,7 +208,7 @@ class HandPoseEstimator:
         tracks, self._tracks = self._tracks if self.tracking else [], []  # what goes wrong with one is not met again
         for track in tracks:
             usual = self.cube_side == self.metadata.get('cube_side')  # another was chosen with a hand in mind
-            cube = Cube(track.center, self.cube_side * (track.scale if usual else 1))
+            cube = Cube.at(track.center, self.cube_side * (track.scale if usual else 1))
             with self._timed('detect'):
                 alive = len(hands) < self.max_hands and holds_a_hand(
                     depth, intrinsics, cube, near=self.near, far=self.far,
@@ -245,7 +245,7 @@ class HandPoseEstimator:
                 break
             if _overlaps(found, hands, self._dismissed):
                 continue
-            track = _Track(id='', center=found.center)
+            track = _Track(id='', center=np.array(found.center))
             reading = self._read(depth, intrinsics, found, track, HOPELESS if hands else 0.0)
             # Where there is a hand, a face or an elbow beside it often scores min_score, hardly ever its square root.
             enough = max(self.min_score, 0) ** 0.5 if hands else self.min_score
@@ -271,7 +271,7 @@ class HandPoseEstimator:
             if (np.linalg.norm(center - reading.cube.center) <= RECENTER_M or center[2] <= self.near
                     or reading.score < hopeless):
                 break
-            reading = self._predict(depth, intrinsics, Cube(tuple(center.tolist()), cube.side), track)
+            reading = self._predict(depth, intrinsics, Cube.at(center, cube.side), track)
         # Joints that are not in front of the camera are no hand, whatever the network thinks of them.
         return reading if reading.joints[:, 2].mean() > 0 else replace(reading, score=-1.0)
 
@@ -316,9 +316,8 @@ class HandPoseEstimator:
     def _follow(self, track: _Track, reading: _Reading, dt: float) -> HandEstimate:
         track.rightness = SIDE_MEMORY * track.rightness + reading.rightness
         track.sizes, track.images = track.sizes + reading.size, track.images + 1
-        center = reading.joints.mean(axis=0)
-        track.center = (float(center[0]), float(center[1]), float(center[2]))
         joints = reading.joints
+        track.center = joints.mean(axis=0)
         if self.smoothing > 0:
             if track.filter is None or track.filter.cutoff_hz != self.smoothing:
                 track.filter = OneEuroFilter(self.smoothing)

@@ -44,19 +44,16 @@ class _Scene:
         self.y = (np.arange(rows, dtype=np.float32) * self.stride + first - intrinsics.cy) / intrinsics.fy
         self.pixel_area = self.stride ** 2 / (intrinsics.fx * intrinsics.fy)  # m2 at 1 m; grows with z squared
 
-    def window(self, center: NDArray[np.float64], side: float) -> tuple[slice, slice]:
-        """Rows and columns whose rays meet the plane of the cube's centre inside the cube."""
-        (x, y, z), half = center, side / 2
-        cols = np.searchsorted(self.x, [(x - half) / z, (x + half) / z])
-        rows = np.searchsorted(self.y, [(y - half) / z, (y + half) / z])
-        return slice(*rows), slice(*cols)
-
     def inside(self, center: NDArray[np.float64], side: float,
                ) -> tuple[NDArray[np.float32], NDArray[np.bool_], slice, slice]:
-        """Depth in the window of a cube, which of it lies within the cube, and the window."""
-        rows, cols = self.window(center, side)
+        """Depth in the window of a cube, which of it lies within the cube, and the window: the rows and columns whose
+        rays meet the plane of the cube's centre inside the cube.
+        """
+        (x, y, middle), half = center, side / 2
+        cols = slice(*np.searchsorted(self.x, [(x - half) / middle, (x + half) / middle]))
+        rows = slice(*np.searchsorted(self.y, [(y - half) / middle, (y + half) / middle]))
         z = self.z[rows, cols]
-        return z, (z > 0) & (np.abs(z - center[2]) <= side / 2), rows, cols
+        return z, (z > 0) & (np.abs(z - middle) <= half), rows, cols
 
     def centroid(self, z: NDArray[np.float32], mask: NDArray[np.bool_], rows: slice, cols: slice,
                  ) -> NDArray[np.float64]:

@@ -5,14 +5,7 @@ from __future__ import annotations
 import os
 
 from rclpy import get_rmw_implementation_identifier
-from rclpy.qos import (
-    QoSDurabilityPolicy,
-    QoSHistoryPolicy,
-    QoSProfile,
-    QoSReliabilityPolicy,
-    qos_policy_name_from_kind,
-)
-from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.qos import QoSDurabilityPolicy, QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 
 from hand_pose_ros.resources import resource
 
@@ -31,16 +24,6 @@ def sensor() -> QoSProfile:
     A new profile each time, because overrides by parameters are written into it.
     """
     return QoSProfile(history=QoSHistoryPolicy.KEEP_LAST, depth=1, reliability=QoSReliabilityPolicy.BEST_EFFORT)
-
-
-def overriding_options() -> QoSOverridingOptions:
-    """Let the user override history, depth and reliability by `qos_overrides.<topic>.subscription.*` parameters."""
-    return QoSOverridingOptions.with_default_policies()
-
-
-def policy_name(kind: int) -> str:
-    """The policy that an event is about, as parameters spell it, e.g. `reliability`."""
-    return str(qos_policy_name_from_kind(kind)).lower()
 
 
 PROFILE_VARIABLES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')  # the second up to Jazzy

@@ -6,7 +6,8 @@ from collections.abc import Callable
 from typing import Any
 
 from rclpy.node import Node
-from rclpy.qos import QoSPolicyKind, QoSReliabilityPolicy
+from rclpy.qos import QoSReliabilityPolicy, qos_policy_name_from_kind
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
@@ -42,17 +43,19 @@ def input_topics(node: Node, transport: str) -> tuple[str, str]:
 
 def subscribe(node: Node, message_type: type, topic: str, callback: Callable[..., None],
               complain: Callable[[str], None]) -> Subscription:
-    """Listen to a sensor; the user may override the quality of service, and hears of publishers that do not fit it.
+    """Listen to a sensor; the user may override history, depth and reliability by the parameters
+    `qos_overrides.<topic>.subscription.*`, and hears of publishers that do not fit.
 
     Raises:
         HandPoseError: the user's quality of service is none.
     """
     def incompatible(event: Any) -> None:
-        complain(explain_incompatible(node, topic, qos.policy_name(event.last_policy_kind)))
+        complain(explain_incompatible(node, topic, qos_policy_name_from_kind(event.last_policy_kind).lower()))
 
     try:
         return node.create_subscription(
-            message_type, topic, callback, qos.sensor(), qos_overriding_options=qos.overriding_options(),
+            message_type, topic, callback, qos.sensor(),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=incompatible))
     except RuntimeError as error:
         raise HandPoseError(f'cannot listen to {topic} ({error}): correct the parameters '
@@ -115,7 +118,7 @@ def explain_silence(node: Node, topic: str, message_type: type, seconds: float) 
     if all(info.qos_profile.reliability != wanted for info in infos) and any(
             listener.topic_name == topic and listener.qos_profile.reliability == wanted
             for listener in node.subscriptions):
-        return explain_incompatible(node, topic, qos.policy_name(QoSPolicyKind.RELIABILITY))
+        return explain_incompatible(node, topic, 'reliability')
     return f'{said}: if it does publish, {remedy_for_lost_images()}'
 
 

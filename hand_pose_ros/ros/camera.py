@@ -66,14 +66,12 @@ class Camera:
             with naming('parameters intrinsics.*'):
                 intrinsics.check_lens()
             return intrinsics
-        def fits() -> bool:
-            return self._fits(width, height, params.use_rectified)
-
+        wanted = width, height, params.use_rectified
         with self._changed:
             self.waiting = True
-            self._changed.wait_for(lambda: self._closed or fits(), params.camera_info_timeout)
+            self._changed.wait_for(lambda: self._closed or self._fits(*wanted), params.camera_info_timeout)
             self.waiting = False
-            if self._closed and not fits():
+            if self._closed and not self._fits(*wanted):
                 raise Closed
             info = self._info
         if info is None:

@@ -110,7 +110,9 @@ class _Sink(Protocol):
     def add(self, image: DepthInput, depth: NDArray[np.float32], intrinsics: Intrinsics,
             hands: Sequence[HandEstimate]) -> None: ...
 
-    def finish(self) -> None: ...
+    def finish(self) -> None:
+        """All images were added."""
+        return
 
 
 def estimate(images: Iterator[DepthInput], count: int, estimator: HandPoseEstimator, sinks: Sequence[_Sink]) -> int:
@@ -197,7 +199,7 @@ def _natural(path: Path) -> list[Any]:
     return [int(part) if part.isdecimal() else part for part in re.split(r'(\d+)', path.name)]
 
 
-class _Overlays:
+class _Overlays(_Sink):
     """A picture of each image."""
 
     def __init__(self, folder: Path, skeleton: Skeleton) -> None:
@@ -212,11 +214,8 @@ class _Overlays:
         picture = cv2.imencode('.png', overlay(depth, intrinsics, hands, self._skeleton))[1]
         write_bytes(path, picture.tobytes())  # OpenCV itself crashes at names that are not UTF-8
 
-    def finish(self) -> None:
-        pass
 
-
-class _Arrays:
+class _Arrays(_Sink):
     """One .npz with everything."""
 
     def __init__(self, path: Path, skeleton: Skeleton) -> None:
@@ -249,7 +248,7 @@ class _Arrays:
                 skeleton=np.array(self._skeleton.name))
 
 
-class _Messages:
+class _Messages(_Sink):
     """An MCAP file with the messages that the node would publish."""
 
     def __init__(self, bag: HandBag) -> None:
@@ -258,6 +257,3 @@ class _Messages:
     def add(self, image: DepthInput, depth: NDArray[np.float32], intrinsics: Intrinsics,
             hands: Sequence[HandEstimate]) -> None:
         self._bag.add(image, hands)
-
-    def finish(self) -> None:
-        pass

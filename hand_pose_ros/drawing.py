@@ -81,14 +81,13 @@ def draw_joints(picture: Picture, joints: ArrayLike, intrinsics: Intrinsics, ske
             _dot(picture, pixels[joint], radius, colors[joint])
 
 
-def draw_cube(picture: Picture, cube: Cube, intrinsics: Intrinsics,
-              color: tuple[int, int, int] = (200, 200, 200)) -> None:
+def draw_cube(picture: Picture, cube: Cube, intrinsics: Intrinsics) -> None:
     """Draw the outline of what the network sees: the cube where it crosses the plane of its centre."""
     half = cube.side / 2
     corners = np.array(cube.center) + [[x * half, y * half, 0] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     pixels = intrinsics.project(corners)
     for start, end in zip(pixels, np.roll(pixels, -1, axis=0), strict=True):
-        _line(picture, start, end, color, 1)
+        _line(picture, start, end, (200, 200, 200), 1)
 
 
 def overlay(depth: NDArray[np.float32], intrinsics: Intrinsics, hands: Sequence[HandEstimate],

@@ -186,8 +186,8 @@ def percentiles(values: ArrayLike) -> dict[str, float]:
 
 
 def paired_bootstrap(a_mm: ArrayLike, b_mm: ArrayLike, *, block: int = 30, resamples: int = 10_000,
-                     confidence: float = 0.95, seed: int = 0) -> tuple[float, float, float]:
-    """Difference mean(a) - mean(b) over the same frames and its confidence interval: (difference, low, high).
+                     seed: int = 0) -> tuple[float, float, float]:
+    """Difference mean(a) - mean(b) over the same frames and its 95 % confidence interval: (difference, low, high).
 
     Circular block bootstrap (Politis & Romano 1992): neighbouring frames of a video err alike, so runs of
     `block` frames are drawn together; single frames (block = 1) would pretend to more evidence than there is.
@@ -211,7 +211,7 @@ def paired_bootstrap(a_mm: ArrayLike, b_mm: ArrayLike, *, block: int = 30, resam
     sums = np.concatenate([[0], np.cumsum(np.concatenate([difference, difference[:block]]))])
     block_means = (sums[block:block + n] - sums[:n]) / block
     starts = np.random.default_rng(seed).integers(0, n, (resamples, -(-n // block)))
-    low, high = np.quantile(block_means[starts].mean(1), [(1 - confidence) / 2, (1 + confidence) / 2])
+    low, high = np.quantile(block_means[starts].mean(1), [0.025, 0.975])
     return float(difference.mean()), float(low), float(high)
 
 

@@ -731,6 +731,24 @@ def test_diagnostics_tell_rates_times_and_hints(rig: Rig) -> None:
     rig.until(lambda: newest()['level'] == b'\x03', 'staleness')
 
 
+def test_camera_info_that_is_published_twice_does_not_make_images_missing(rig: Rig) -> None:
+    """As by openni2_camera, which has two depth images, and for each of them publishes the same camera_info."""
+    node = rig.start()
+    publish = rig.camera()
+    infos = rig.client.create_publisher(CameraInfo, 'depth/camera_info', RELIABLE)
+    rig.connected(infos)
+    for stamp in range(1, 21):
+        for _ in range(2):
+            before = node._camera._info
+            infos.publish(stamped(camera_info(), stamp))
+            rig.until(lambda before=before: node._camera._info is not before, 'the camera_info')
+        rig.answer(publish, image(depth_with_hand(), stamp))
+    reports = rig.received[DiagnosticArray]
+    seen = len(reports)
+    rig.until(lambda: len(reports) > seen + 1, 'diagnostics of all of them')
+    assert not any('but only' in report.status[0].message for report in reports)
+
+
 def test_two_nodes_that_publish_the_same_joints_are_told(rig: Rig) -> None:
     rig.start()
     assert not any('somebody else' in text for text in rig.said())

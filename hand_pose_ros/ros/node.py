@@ -80,6 +80,7 @@ class EstimatorNode(LifecycleNode):
         self._inputs: list[Subscription] = []
         self._latched: Subscription | None = None  # to a camera_info that was published before the node came
         self._published = False  # does anybody publish images?
+        self._info_stamp = -1  # of the newest camera_info, ns
         self._reset = False  # asked for; the worker, who alone touches the estimator, does it
         super().__init__('estimator', **kwargs)
         self._params = parameters.declare(self)
@@ -199,7 +200,9 @@ class EstimatorNode(LifecycleNode):
         self._statistics.count(received=1, dropped=dropped, waited=int(dropped and self._camera.waiting))
 
     def _on_camera_info(self, info: CameraInfo) -> None:
-        self._statistics.count(camera_infos=1)
+        stamp = stamp_ns(info.header)  # openni2_camera publishes each one twice, for its raw and its metric images
+        self._statistics.count(camera_infos=int(stamp != self._info_stamp))
+        self._info_stamp = stamp
         self._camera.update(info)
 
     def _on_region(self, region: RegionOfInterest) -> None:

@@ -83,6 +83,9 @@ def decode_compressed(msg: Any, depth_scale: float = 0.001, *, source: str = '')
         if encoding not in DEPTH_ENCODINGS:
             raise InputError(f'the format {msg.format!r:.80} is not compressed depth: choose a topic whose format '
                              f"begins with {', '.join(DEPTH_ENCODINGS)} (such as '16UC1; compressedDepth png')")
+        if 'tiff' in words:
+            raise InputError(f'the format {msg.format!r:.80} is TIFF, which is not read: take the raw image or '
+                             'compressedDepth, or have PNG published (kinect2_bridge: use_png:=true)')
         data = memoryview(msg.data).cast('B')
         plain = bytes(data[:8]) == _PNG_SIGNATURE  # the `compressed` transport writes no header
         if DEPTH_ENCODINGS[encoding].kind == 'u':

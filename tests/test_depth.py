@@ -161,6 +161,8 @@ def test_inverse_depth_of_32fc1(encode):
 @pytest.mark.parametrize(('message', 'says'), [
     (compressed('rgb8; jpeg compressed bgr8', b'\xff\xd8'), 'rgb8; jpeg'),
     (compressed('', b''), "format ''"),
+    (compressed('16UC1; tiff compressed', cv2.imencode('.tif', np.ones((4, 4), np.uint16))[1].tobytes(), b''), 'TIFF'),
+    (compressed('32FC1; tiff compressed', cv2.imencode('.tif', np.ones((4, 4), np.float32))[1].tobytes(), b''), 'TIFF'),
     (compressed('16UC1; compressedDepth png', b''), 'not a PNG'),
     (compressed('16UC1; compressedDepth png', b'', b''), 'not a PNG'),
     (compressed('16UC1; compressedDepth png', encode_png(np.ones((4, 4), np.uint16))[:20]), 'not a PNG'),

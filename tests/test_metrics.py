@@ -40,7 +40,8 @@ def test_missing_predictions_fail_and_unlabelled_joints_do_not_count():
     truth[3] = NAN  # a frame not labelled
     predictions = np.full((4, 2, 3), [0.003, 0.004, 0])
     predictions[0, 1] = NAN  # one joint missed
-    predictions[1] = INF  # a frame missed
+    predictions[1, 0] = INF  # a frame missed
+    predictions[1, 1, 2] = INF
     errors = metrics.joint_errors_mm(predictions, truth)
     assert np.array_equal(errors, [[5, INF], [INF, INF], [5, NAN], [NAN, NAN]], equal_nan=True)
     assert metrics.mean_mm(errors) == pytest.approx(5)
@@ -48,6 +49,21 @@ def test_missing_predictions_fail_and_unlabelled_joints_do_not_count():
     assert metrics.success_curve(errors, [1e9]).tolist() == pytest.approx([1 / 3])
     assert metrics.pck(errors, [1e9]).tolist() == pytest.approx([2 / 5])
     assert metrics.auc(errors, 80) == pytest.approx((0 + 0 + 75 / 80) / 3)
+
+
+def test_the_summary_of_a_hand_worked_case():
+    truth = np.random.default_rng(5).normal(0, 0.1, (4, 21, 3))
+    truth[3, 20] = NAN
+    predictions = truth @ Rotation.from_euler('z', 90, degrees=True).as_matrix()
+    predictions[:2] = truth[:2] + np.array([0.027, 0, 0.036])  # 45 mm
+    predictions[1, 4], predictions[2] = truth[1, 4], NAN
+    summary = metrics.summarise(predictions, truth, HAND21)
+    assert (summary['frames'], summary['missed_frames'], summary['missed_joints']) == (4, 1, 21)
+    assert summary['pck_mm']['20'] == pytest.approx(1 / 83) and summary['within_mm']['20'] == 0
+    assert summary['within_mm']['50'] == pytest.approx(2 / 4)
+    assert summary['mean_rigid_aligned_mm'] < 5 < 20 < summary['mean_translation_aligned_mm']
+    assert summary['error_jitter_mm'] is None, 'no three frames in a row have a hand'
+    assert metrics.percentiles([*range(101), INF]) == {'mean': 50, 'p50': 50, 'p90': 90, 'p99': 99, 'max': 100}
 
 
 def test_nothing_labelled_gives_nan_and_none_not_a_number():
@@ -87,11 +103,15 @@ def test_alignment_ignores_missing_joints():
     predictions = truth + np.array([0.01, 0, 0.02])
     predictions[0, 2] = NAN
     predictions[1, 2:] = NAN
+    truth[0, 5] = NAN
     moved = metrics.joint_errors_mm(metrics.align_translation(predictions, truth), truth)
     assert np.isinf(moved[0, 2]) and moved[np.isfinite(moved)] == pytest.approx(0, abs=1e-9)
     rigid = metrics.joint_errors_mm(metrics.align_rigid(predictions, truth), truth)
-    assert rigid[0, [0, 1, 3, 4, 5]] == pytest.approx(0, abs=1e-9)
+    assert rigid[0, [0, 1, 3, 4]] == pytest.approx(0, abs=1e-9)
     assert np.isinf(rigid[1]).all(), 'two points do not fix a rotation'
+    predictions[1, 2] = truth[1, 2] + np.array([0.01, 0, 0.02])
+    rigid = metrics.joint_errors_mm(metrics.align_rigid(predictions, truth), truth)
+    assert rigid[1, :3] == pytest.approx(0, abs=1e-9), 'three do'
 
 
 def test_jitter_is_the_size_of_noise_and_zero_for_smooth_motion():
@@ -138,6 +158,8 @@ def test_bootstrap_in_blocks_is_wider_where_neighbours_err_alike():
     blocks = metrics.paired_bootstrap(slow, np.zeros(1500), block=30)
     assert single[0] == blocks[0] == pytest.approx(slow.mean())
     assert blocks[2] - blocks[1] > 3 * (single[2] - single[1])
+    _, low, high = metrics.paired_bootstrap(slow[:40], np.zeros(40), block=10**6)
+    assert low < high, 'of a few frames, too, there are several blocks'
 
 
 def test_bootstrap_leaves_out_frames_that_one_side_lacks():

@@ -1,6 +1,7 @@
 """What bags promise: three formats in, frame by frame with their camera; complete or not there at all when written."""
 
 import os
+import shutil
 import sqlite3
 import struct
 import subprocess
@@ -259,11 +260,23 @@ def test_an_interrupted_mcap_gives_what_was_complete(tmp_path, depths, keep):
     assert f'{len(frames)} of' in said
 
 
+def test_an_interrupted_mcap_may_end_anywhere(tmp_path, depths):
+    data = write(tmp_path / 'whole.mcap', depths).read_bytes()
+    end = data.rindex(struct.pack('<BQ', 0x0f, 4))  # of the data section
+    for rest in (data[:end], *(data[:end - cut] for cut in range(1, 20)), data[:end] + bytes(100)):
+        (tmp_path / 'cut.mcap').write_bytes(rest)
+        frames, said = read_until_damage(tmp_path / 'cut.mcap')
+        assert len(frames) == len(depths) and 'cut.mcap: the bag was cut short' in said
+
+
 def test_a_folder_without_metadata_is_read(tmp_path, depths):
     """As `ros2 bag record` leaves it when it is killed."""
     path = write(tmp_path / 'folder', depths)
     (path / 'metadata.yaml').unlink()
     assert_same(path, depths)
+    shutil.copy(path / 'folder.mcap', path / 'folder_1.mcap')  # which of several is to be read first?
+    with pytest.raises(InputError, match=r'folder: .* ros2 bag reindex'):
+        DepthBag(path)
 
 
 @pytest.mark.parametrize(('name', 'remedy'), [

@@ -63,6 +63,9 @@ def test_the_summary_of_a_hand_worked_case():
     assert summary['within_mm']['50'] == pytest.approx(2 / 4)
     assert summary['mean_rigid_aligned_mm'] < 5 < 20 < summary['mean_translation_aligned_mm']
     assert summary['error_jitter_mm'] is None, 'no three frames in a row have a hand'
+    constant = metrics.summarise(truth[:3] + 0.01, truth[:3], HAND21)
+    assert constant['error_jitter_mm'] == pytest.approx(0, abs=1e-9) and constant['jitter_mm'] > 10
+    assert metrics.finite_or_none({'a': [1.5], 'b': INF, 'c': {'d': NAN}}) == {'a': [1.5], 'b': None, 'c': {'d': None}}
     assert metrics.percentiles([*range(101), INF]) == {'mean': 50, 'p50': 50, 'p90': 90, 'p99': 99, 'max': 100}
 
 
@@ -78,6 +81,8 @@ def test_wrong_shapes_are_refused():
         metrics.joint_errors_mm(np.zeros((2, 14, 3)), np.zeros((2, 16, 3)))
     with pytest.raises(InputError, match='there are 14 joints, but hand21 has 21'):
         metrics.summarise(np.zeros((2, 14, 3)), np.zeros((2, 14, 3)), HAND21)
+    with pytest.raises(InputError, match='there are 22 joints, but hand21 has 21'):
+        metrics.summarise(np.zeros((2, 22, 3)), np.zeros((2, 22, 3)), HAND21)
 
 
 @given(seed=st.integers(0, 2**32 - 1))

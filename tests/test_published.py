@@ -101,7 +101,8 @@ def test_text_files_are_read_in_every_form(tmp_path, uvd, suffix, named):
 
 def test_nan_and_zero_joints_are_missing(tmp_path, uvd):
     broken = uvd.copy()
-    broken[0, 3], broken[1, 0, 0], broken[2] = 0, np.nan, np.nan
+    broken[0, 3], broken[1, 0, 0], broken[2], broken[4, 1] = 0, np.nan, np.nan, 0
+    uvd[4, 1] = 0  # is not labelled either
     result = load_published(write_uvd(tmp_path / 'p.txt', broken), write_uvd(tmp_path / 'g.txt', uvd), NYU)
     summary = result.summary()
     assert '16 joints are missing in p.txt' in result.notes[0]

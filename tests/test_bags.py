@@ -17,7 +17,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
 from hand_pose_ros.bags import Bag, BagWriter, DepthBag, read_hands
-from hand_pose_ros.bags.bag import typestore
+from hand_pose_ros.bags.bag import SIDES, typestore
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.geometry import Cube, Intrinsics
 from hand_pose_ros.skeleton import HAND21, Skeleton
@@ -164,6 +164,7 @@ def test_of_several_depth_topics_one_must_be_chosen(tmp_path, depths):
     with BagWriter(tmp_path / 'two.mcap') as bag:
         for name in ('left', 'right'):
             bag.write_depth(STAMPS[0], name, depths[name == 'right'], CAMERA, topic=f'/{name}/image', codec=None)
+        bag._writer.add_connection('/never/image', 'sensor_msgs/msg/Image', typestore=typestore())
     with pytest.raises(InputError, match=r'several topics carry depth: choose one of /left/image, /right/image'):
         DepthBag(tmp_path / 'two.mcap')
     with DepthBag(tmp_path / 'two.mcap', depth_topic='/right/image') as bag:
@@ -215,6 +216,19 @@ def test_the_newest_camera_info_counts(tmp_path, depths):
             bag.write_depth(stamp, 'camera', depths[0], camera)
     with DepthBag(tmp_path / 'zoom.mcap') as bag:
         assert [frame.intrinsics.fx for frame in bag] == [300.5, 300.5, 600, 600]
+
+
+def test_each_image_has_the_camera_of_its_frame(tmp_path, depths):
+    with BagWriter(tmp_path / 'two.mcap') as bag:
+        write = bag.write_serialized  # all camera_infos come first
+        bag.write_serialized = lambda topic, kind, data, at, **more: write(
+            topic, kind, data, at - 10**9 * topic.endswith('info'), **more)
+        for i, frame_id in enumerate(('left', 'right')):
+            bag.write_depth(STAMPS[i], frame_id, depths[0], Intrinsics(300 + i, 300, 32, 24, 64, 48))
+    with DepthBag(tmp_path / 'two.mcap', depth_scale=0.01) as bag:
+        frames = list(bag)
+    assert [(frame.frame_id, frame.intrinsics.fx) for frame in frames] == [('left', 300), ('right', 301)]
+    np.testing.assert_allclose(frames[0].depth, 10 * depths[0], rtol=1e-6)
 
 
 def test_a_damaged_image_spoils_only_itself(tmp_path, depths):
@@ -318,6 +332,8 @@ def test_hands_come_back_as_written(tmp_path):
             np.testing.assert_array_equal(record.confidence[i], h.confidence)
     with pytest.raises(InputError, match='named /other, but the bag has /hand/joints'):
         read_hands(tmp_path / 'hands.mcap', topic='/other')
+    message = typestore().types['hand_pose_ros/msg/HandJoints']
+    assert [getattr(message, side.upper()) for side in SIDES] == [0, 1, 2]
 
 
 @pytest.mark.parametrize('skeleton', [HAND21, Skeleton('paw', ('toe',), (-1,))])

@@ -19,11 +19,13 @@ from scipy.io import savemat
 from hand_pose_ros.bags.writer import BagWriter
 from hand_pose_ros.datasets import DatasetError, joints_in_metres, open_dataset
 from hand_pose_ros.datasets import icvl as icvl_module
+from hand_pose_ros.datasets import msra as msra_module
 from hand_pose_ros.datasets import nyu as nyu_module
 from hand_pose_ros.datasets.base import center_of_mass_cube
 from hand_pose_ros.datasets.shards import DiskShards, MemoryShards
+from hand_pose_ros.errors import InputError
 from hand_pose_ros.geometry import Cube, Intrinsics
-from hand_pose_ros.skeleton import HAND21
+from hand_pose_ros.skeleton import HAND21, Skeleton
 
 SPLITS = ('train', 'val', 'test', 'test_1', 'test_2')
 
@@ -78,7 +80,9 @@ def test_nyu(tmp_path, monkeypatch):
     np.testing.assert_allclose(frame.depth, surface, atol=0.0006)
     assert (frame.depth[surface == 0] == 0).all()
     assert [dataset.frame(i).cube_side for i in range(3)] == pytest.approx([0.3, 0.3, 0.249])
-    np.testing.assert_allclose(open_dataset('nyu', 'val', tmp_path).frame(0).joints, train[5][list(nyu_module.JOINTS)])
+    val = open_dataset('nyu', 'val', tmp_path).frame(0)
+    np.testing.assert_allclose(val.joints, train[5][list(nyu_module.JOINTS)])
+    assert val.cube_side == 0.3, 'only the second subject that tests has a smaller hand'
 
     batch = dataset.batch(torch.tensor([2, 0]))
     metres = joints_in_metres(batch['joints'], batch['cube_center'], batch['cube_side'])
@@ -138,6 +142,11 @@ def test_icvl(tmp_path, labels):
     words = (tmp_path / 'test_seq_2.txt').read_text().split()
     np.testing.assert_allclose(frame.intrinsics.project(frame.joints[3]), [float(w) for w in words[10:12]], atol=1e-6)
     assert frame.depth.max() == pytest.approx(0.4, abs=0.02)
+    assert (frame.seed == frame.joints[0]).all() and frame.cube_side == 0.25
+    (tmp_path / 'Testing').mkdir()
+    for name in ('test_seq_1.txt', 'test_seq_2.txt', 'Depth'):
+        (tmp_path / name).rename(tmp_path / 'Testing' / name)
+    assert open_dataset('icvl', 'test', tmp_path).size == 3  # as distributed
 
 
 def test_icvl_says_what_is_missing(tmp_path):
@@ -175,7 +184,7 @@ def write_msra(root: Path, rng: np.random.Generator) -> np.ndarray:
     return kept
 
 
-def test_msra_leaves_one_subject_out_and_goes_by_file_name(tmp_path):
+def test_msra_leaves_one_subject_out_and_goes_by_file_name(tmp_path, monkeypatch):
     joints = write_msra(tmp_path, np.random.default_rng(3))
     sizes = {split: open_dataset('msra:P2', split, tmp_path).size for split in ('train', 'val', 'test')}
     assert sizes == {'train': 21, 'val': 3, 'test': 3}
@@ -184,7 +193,9 @@ def test_msra_leaves_one_subject_out_and_goes_by_file_name(tmp_path):
     surface = blob(icvl_module.INTRINSICS, joints[3].mean(0))
     np.testing.assert_allclose(test.frame(2).depth[80:160, 100:220], surface[80:160, 100:220], atol=1e-6)
     assert test.frame(2).depth[:80].max() == 0
-    assert test.frame(0).cube_side == 0.2
+    assert test.frame(0).cube_side == 0.2 and (test.frame(0).seed == test.frame(0).joints[5]).all()
+    monkeypatch.setitem(msra_module.FAULTY, ('P3', '1'), {1})
+    assert open_dataset('msra:P2', 'val', tmp_path).size == 2, 'wrong labels are left out'
     path = tmp_path / 'P2' / '1' / '000001_depth.bin'
     path.write_bytes(path.read_bytes()[:-4])
     with pytest.raises(DatasetError, match=r'000001_depth\.bin is damaged'):
@@ -199,15 +210,31 @@ BAG_CAMERA = Intrinsics(300, 300, 160, 120, 320, 240)
 
 
 def write_hand(bag: BagWriter, stamp: int, side: str, joints: np.ndarray) -> None:
-    bag.write_hands(stamp, 'camera', [SimpleNamespace(
-        id='0', side=side, score=1.0, joints=joints, confidence=np.ones(21, np.float32),
-        cube=Cube((0.1, 0.0, 0.5), 0.3))], HAND21)
+    bag.write_hands(stamp, 'camera', [labelled(side, joints)], HAND21)
 
 
-def test_bags(tmp_path):
+def labelled(side: str, joints: np.ndarray) -> SimpleNamespace:
+    return SimpleNamespace(id='0', side=side, score=1.0, joints=joints, confidence=np.ones(21, np.float32),
+                           cube=Cube((0.1, 0.0, 0.5), 0.3))
+
+
+def test_hands_of_one_image_have_sides_of_their_own_and_must_be_told_in_its_frame(tmp_path):
+    joints = scattered(np.random.default_rng(4), 21, np.array([0.1, 0.0, 0.5]))
+    for name, frame in (('train', 'camera'), ('test', 'world')):
+        with BagWriter(tmp_path / name / 'mine.mcap') as bag:
+            bag.write_depth(1000, 'camera', blob(BAG_CAMERA, joints.mean(0)), BAG_CAMERA)
+            bag.write_hands(1000, frame, [labelled('right', joints), labelled('left', joints)], HAND21)
+    train = open_dataset('bags', 'train', tmp_path)
+    assert [train.frame(i).left for i in range(2)] == [False, True]
+    with pytest.raises(InputError, match="its joints are in frame 'world', but the images in 'camera'"):
+        open_dataset('bags', 'test', tmp_path).frame(0)
+
+
+def test_bags(tmp_path, caplog):
     rng, camera = np.random.default_rng(4), BAG_CAMERA
     hands = []
-    with BagWriter(tmp_path / 'train' / 'mine.mcap') as bag:
+    (tmp_path / 'train' / 'notes').mkdir(parents=True)  # is no bag
+    with BagWriter(tmp_path / 'train' / 'mine') as bag:
         for i, side in enumerate(('left', 'right', 'right')):
             joints = scattered(rng, 21, np.array([0.1, 0.0, 0.5])).astype(np.float32)
             hands.append(joints)
@@ -222,8 +249,14 @@ def test_bags(tmp_path):
     np.testing.assert_allclose(metres[0], hands[2], atol=1e-5)
     np.testing.assert_allclose(metres[1], hands[0] * (-1, 1, 1), atol=1e-5)  # a left hand is mirrored in
     assert (batch['patch'] < 1).float().mean() > 0.05
+    assert not caplog.messages, 'every hand can be used as it is'
     with pytest.raises(DatasetError, match='val holds no bags'):
         open_dataset('bags', 'val', tmp_path)
+    with BagWriter(tmp_path / 'train' / 'other.mcap') as bag:
+        bag.write_hands(1, 'elsewhere', [labelled('right', hands[0])], Skeleton('other', HAND21.joint_names,
+                                                                                HAND21.parents))
+    with pytest.raises(DatasetError, match='train must hold hands of one skeleton, not of hand21, other'):
+        open_dataset('bags', 'train', tmp_path)
 
 
 def test_bags_that_were_corrected_are_not_read_from_the_cache(tmp_path):
@@ -286,8 +319,19 @@ def test_the_crop_is_centred_on_what_is_there():
     assert 0.44 < cube.center[2] < 0.48
     nothing = Cube((0.0, 0.0, 2.0), 0.3)
     assert center_of_mass_cube(np.zeros((240, 320), np.float32), nothing, camera) == nothing
-    near = center_of_mass_cube(blob(camera, np.array([0.0, 0.0, 0.12])), Cube((0.0, 0.0, 0.12), 0.3), camera)
-    assert near.center[2] > 0.06, 'pixels without a reading are no surface'
+    close = blob(camera, np.array([0.0, 0.0, 0.12]))
+    near = center_of_mass_cube(close, Cube((0.0, 0.0, 0.12), 0.3), camera)
+    assert near.center[2] == pytest.approx(close[close > 0].mean()), 'pixels without a reading are no surface'
+    corner = Cube((-0.26, -0.2, 0.5), 0.3)  # partly outside of the image
+    assert center_of_mass_cube(blob(camera, np.array(corner.center)), corner, camera).center[2] < 0.49
+    outside = Cube((-0.6, 0.0, 0.5), 0.3)
+    assert center_of_mass_cube(np.full((240, 320), 0.5, np.float32), outside, camera) == outside
+    outside = Cube((0.0, -0.5, 0.5), 0.3)
+    assert center_of_mass_cube(np.full((240, 320), 0.5, np.float32), outside, camera) == outside
+    flat = Intrinsics(300, 100, 160, 120, 320, 240)
+    strip = np.zeros((240, 320), np.float32)
+    strip[120:160] = 0.5  # of which the cube holds 30 rows
+    assert flat.project(center_of_mass_cube(strip, Cube((0.0, 0.0, 0.5), 0.3), flat).center)[1] == pytest.approx(134.5)
 
 
 def test_training_hands_can_do_without_an_ingredient():

@@ -124,11 +124,11 @@ def test_the_table_can_be_written_where_there_are_no_signs_but_ascii(tmp_path, u
 def test_names_on_both_sides_decide_what_belongs_together(tmp_path, uvd):
     names = [f'{k}.png' for k in range(5)]
     truth = write_uvd(tmp_path / 'g.txt', uvd, names)
-    shuffled = write_uvd(tmp_path / 'p.txt', uvd[[3, 0]], ['3.png', '0.png'])
+    shuffled = write_uvd(tmp_path / 'p.txt', uvd[[3, 0, 1]], ['3.png', '0.png', '1.png'])
     result = load_published(shuffled, truth, NYU)
-    assert result.summary()['max_mm'] == pytest.approx(0, abs=1e-6) and '2 of the 5 frames' in result.notes[0]
+    assert result.summary()['max_mm'] == pytest.approx(0, abs=1e-6) and '3 of the 5 frames' in result.notes[0]
     # Rows are those of the dataset, in its order, and what has gaps tells nothing of jitter.
-    np.testing.assert_allclose(result.truth, load_published(truth, truth, NYU).truth[[0, 3]])
+    np.testing.assert_allclose(result.truth, load_published(truth, truth, NYU).truth[[0, 1, 3]])
     assert result.summary()['jitter_mm'] is None
     backwards = load_published(write_uvd(tmp_path / 'b.txt', uvd[::-1], names[::-1]), truth, NYU)
     np.testing.assert_allclose(backwards.predictions, load_published(truth, truth, NYU).predictions)
@@ -211,9 +211,10 @@ def test_nyu_depth_is_written_in_green_and_blue(tmp_path):
     picture = np.zeros((480, 640, 3), np.uint8)
     picture[0, 0] = 0x21, 0x03, 0  # B, G, R: 0x0321 = 801 mm
     picture[0, 1] = 0xD1, 0x07, 0  # 2001: no data
+    picture[1, 1] = 0xD0, 0x07, 0  # 2000 is the last that is
     cv2.imwrite(str(tmp_path / 'depth_1_0000002.png'), picture)
     depths = tompson.read_nyu_depths(tmp_path, [0, 1])
-    assert list(depths) == [1] and depths[1][:2, :2] == pytest.approx(np.array([[0.801, 0], [0, 0]]))
+    assert list(depths) == [1] and depths[1][:2, :2] == pytest.approx(np.array([[0.801, 0], [0, 2]]))
     cv2.imwrite(str(tmp_path / 'depth_1_0000004.png'), picture[::2, ::2])
     with pytest.raises(HandPoseError, match=r'depth_1_0000004\.png has 320x240 pixels, .* have 640x480'):
         tompson.read_nyu_depths(tmp_path, [3])

@@ -26,6 +26,7 @@ from hand_pose_ros.datasets.shards import DiskShards, MemoryShards
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.geometry import Cube, Intrinsics
 from hand_pose_ros.skeleton import HAND21, Skeleton
+from hand_pose_ros.synthetic import benchmark
 
 SPLITS = ('train', 'val', 'test', 'test_1', 'test_2')
 
@@ -366,6 +367,8 @@ def test_synthetic_hands_are_right_hands_to_the_network():
     expected[left, :, 0] *= -1
     metres = joints_in_metres(seen['joints'], seen['cube_center'], seen['cube_side'])
     torch.testing.assert_close(metres[seen['hand_present']], expected[seen['hand_present']], atol=1e-6, rtol=0)
+    test, [judged] = open_dataset('synthetic', 'test').batch(torch.arange(8)), benchmark.frames(8)
+    assert torch.equal(test['patch'], judged['patch'])  # it is synthetic-test-v1
 
 
 @pytest.mark.parametrize(('name', 'split', 'message'), [

@@ -198,12 +198,13 @@ def test_lifting_a_hand_worked_case():
     camera = Intrinsics(100, 100, 10, 10, 20, 20)
     depth = np.zeros((20, 20), np.float32)
     depth[10, 10], depth[10, 15], depth[5, 10] = 0.6, 0.9, 0.3  # the hand, the wall behind, something before
-    pixels = np.array([[10.4, 9.6], [15, 10], [10, 5], [2, 2], [500, 3]])
-    truth = np.array([0.61, 0.62, 0.63, 0.64, 0.65])
+    depth[0, 0] = 0.7
+    pixels = np.array([[10.4, 9.6], [15, 10], [10, 5], [2, 2], [20, 3], [3, 20], [0, 0]])
+    truth = np.array([0.61, 0.62, 0.63, 0.64, 0.65, 0.66, 0.67])
     paper = tompson.lift(pixels, depth, camera, 0.65, 0.3, truth, 'paper')
-    assert paper[:, 2] == pytest.approx([0.6, 0.8, 0.8, 0.8, 0.8]), 'the back face of the cube is at 0.8 m'
+    assert paper[:, 2] == pytest.approx([0.6, 0.8, 0.8, 0.8, 0.8, 0.8, 0.7]), 'the back face of the cube is at 0.8 m'
     code = tompson.lift(pixels, depth, camera, 0.65, 0.3, truth, 'code')
-    assert code[:, 2] == pytest.approx([0.6, 0.62, 0.63, 0.64, 0.65])
+    assert code[:, 2] == pytest.approx([0.6, 0.62, 0.63, 0.64, 0.65, 0.66, 0.7])
     assert camera.project(paper) == pytest.approx(pixels)
 
 

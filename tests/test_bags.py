@@ -352,6 +352,16 @@ def test_hands_without_all_their_joints_are_refused(tmp_path, skeleton):
         assert read_hands(tmp_path / 'part.mcap')[0].joints.shape == (1, 20, 3)
 
 
+def test_hands_may_be_recorded_later_than_their_image(tmp_path):
+    with BagWriter(tmp_path / 'hands.mcap') as bag:
+        bag.write_skeleton(1, 'camera', HAND21, 'a network', '1.2', recorded_ns=9)
+        bag.write_hands(1, 'camera', [hand(1)], recorded_ns=9)
+        bag.write_markers(1, 'camera', [], recorded_ns=9)
+    with Bag(tmp_path / 'hands.mcap') as bag:
+        assert [at for _, at, _ in bag.messages(bag.connections)] == [9, 9, 9]
+    assert read_hands(tmp_path / 'hands.mcap')[0].stamp_ns == 1
+
+
 def test_the_skeleton_is_recorded_latched(tmp_path):
     with BagWriter(tmp_path / 'hands.mcap') as bag:
         bag.write_skeleton(STAMPS[0], 'camera', HAND21, 'a network', '1.2')

@@ -52,6 +52,11 @@ def test_an_estimate_survives_the_way_through_a_message() -> None:
     np.testing.assert_array_equal(after.confidence, before.confidence)
     assert (after.side, after.id, after.score, after.joint_names) == ('left', 'hand_1', 0.75, HAND21.joint_names)
     assert after.cube.center == before.cube.center and after.cube.side == pytest.approx(0.3)
+    message.hands[0].side = 9
+    assert hand_from_msg(message.hands[0], HAND21).side == 'unknown'
+    message.hands[0].confidence = [1.0] * 20
+    with pytest.raises(InputError, match='a hand has 21 joints and 20 confidences'):
+        hand_from_msg(message.hands[0], HAND21)
 
 
 def test_the_skeleton_message_names_every_joint_and_its_parent() -> None:
@@ -66,6 +71,7 @@ def test_markers_are_joints_and_bones_in_the_colours_of_the_fingers() -> None:
     array_ = markers_to_msg(header(), HandMarkers(HAND21).update([estimate]), 0.5)
     markers = {marker.ns: marker for marker in array_.markers}
     joints, bones, cube = (markers[f'hand_1/{part}'] for part in ('joints', 'bones', 'cube'))
+    assert all(marker.pose.orientation.w == 1 for marker in array_.markers)  # viewers warn of one that is all zero
     points = np.array([(p.x, p.y, p.z) for p in joints.points])
     np.testing.assert_allclose(points, estimate.joints, atol=1e-6)
     tip = HAND21.joint_names.index('pinky_tip')
@@ -160,7 +166,7 @@ def test_depth_that_cannot_hold_a_hand_is_explained() -> None:
 
 
 @pytest.mark.parametrize('wrong, words', [
-    ({'side': 'both'}, 'auto, left, right'), ({'device': 'gpu'}, 'cuda'), ({'min_depth': 2.0}, 'max_depth'),
+    ({'side': 'both'}, 'auto, left, right'), ({'device': 'gpu'}, 'cuda'), ({'min_depth': 1.5}, 'max_depth'),
     ({'cube_size': 0.01}, '0.05'),
     ({'transport': 'theora'}, 'compressedDepth')])
 def test_contradicting_parameters_are_refused(wrong: dict, words: str) -> None:

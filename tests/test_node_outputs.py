@@ -119,7 +119,9 @@ def test_hands_in_another_frame() -> None:
     np.testing.assert_allclose(xyz(after.hands[0].joints), np.stack([z, -x, 2 - y], 1), atol=1e-12)
     np.testing.assert_allclose(xyz([after.hands[0].cube_center]), [(0.5, 0, 2)], atol=1e-12)
     assert (after.header.frame_id, after.header.stamp.sec, before.header.frame_id) == ('base_link', 5, 'camera')
-    assert after.hands[0].confidence == before.hands[0].confidence and after.skeleton == 'hand21'
+    assert after.skeleton == 'hand21'
+    for field in ('id', 'side', 'score', 'confidence', 'cube_size'):
+        assert getattr(after.hands[0], field) == getattr(before.hands[0], field)
 
 
 # ------------------------------------------------------------------------------------------------------------ the node

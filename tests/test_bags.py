@@ -20,6 +20,7 @@ from hand_pose_ros.bags import Bag, BagWriter, DepthBag, read_hands
 from hand_pose_ros.bags.bag import SIDES, typestore
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.geometry import Cube, Intrinsics
+from hand_pose_ros.markers import HandMarkers, Marker
 from hand_pose_ros.skeleton import HAND21, Skeleton
 
 CAMERA = Intrinsics(300.5, 301.5, 31.5, 23.5, 64, 48)
@@ -330,6 +331,13 @@ def test_hands_come_back_as_written(tmp_path):
         for i, h in enumerate(present):
             np.testing.assert_array_equal(record.joints[i], h.joints)
             np.testing.assert_array_equal(record.confidence[i], h.confidence)
+            assert record.scores[i] == h.score
+    with Bag(tmp_path / 'hands.mcap') as bag:
+        [joints] = [connection for connection in bag.connections if connection.topic == '/hand/joints']
+        *_, last = (bag.deserialize(joints, data) for _, _, data in bag.messages([joints]))
+    for message in last.hands:
+        center = message.cube_center
+        assert (center.x, center.y, center.z, message.cube_size) == pytest.approx((0.1, -0.2, 0.6, 0.25))
     with pytest.raises(InputError, match='named /other, but the bag has /hand/joints'):
         read_hands(tmp_path / 'hands.mcap', topic='/other')
     message = typestore().types['hand_pose_ros/msg/HandJoints']
@@ -350,6 +358,20 @@ def test_hands_without_all_their_joints_are_refused(tmp_path, skeleton):
             read_hands(tmp_path / 'part.mcap')
     else:  # how many an unknown one has is not known
         assert read_hands(tmp_path / 'part.mcap')[0].joints.shape == (1, 20, 3)
+
+
+def test_markers_come_back_as_written(tmp_path):
+    markers = [*HandMarkers(HAND21).update([hand(1)]), Marker('gone', action=2)]
+    with BagWriter(tmp_path / 'markers.mcap') as bag:
+        bag.write_markers(1, 'camera', markers)
+    with Bag(tmp_path / 'markers.mcap') as bag:
+        shown = bag.first(bag.connections[0]).markers
+    for message, marker in zip(shown, markers, strict=True):
+        assert (message.ns, message.type, message.action) == (marker.namespace, marker.type, marker.action)
+        assert message.header.frame_id == 'camera' and message.pose.orientation.w == 1
+        assert [(p.x, p.y, p.z) for p in message.points] == [tuple(map(float, point)) for point in marker.points]
+        colors = [(c.r, c.g, c.b, c.a) for c in message.colors]
+        np.testing.assert_allclose(colors, list(marker.colors), rtol=1e-6)
 
 
 def test_hands_may_be_recorded_later_than_their_image(tmp_path):

@@ -1,6 +1,7 @@
 """What `replay` promises: a bag on ROS topics as it was recorded. The real node, over real DDS."""
 
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,12 +11,13 @@ pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
 
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
+from rosbags.interfaces import QosReliability  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
 from sensor_msgs.msg import CameraInfo, Image  # noqa: E402
 from std_srvs.srv import SetBool  # noqa: E402
 from test_bags import CAMERA, STAMPS, write_ros1  # noqa: E402
 
-from hand_pose_ros.bags import Bag, BagWriter  # noqa: E402
+from hand_pose_ros.bags import Bag, BagWriter, writer  # noqa: E402
 from hand_pose_ros.cli import main  # noqa: E402
 from hand_pose_ros.depth import decode_image  # noqa: E402
 from hand_pose_ros.errors import InputError  # noqa: E402
@@ -194,6 +196,18 @@ def test_best_effort_on_request(bag, listener, play):
     replay = play(bag, reliability='best_effort')
     [info] = replay.node.get_publishers_info_by_topic('/depth/image_rect')
     assert info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+
+
+def test_best_effort_where_it_was_recorded_so(tmp_path, listener, play, monkeypatch):
+    monkeypatch.setattr(writer, 'QosReliability', SimpleNamespace(RELIABLE=QosReliability.BEST_EFFORT))
+    with BagWriter(tmp_path / 'lossy.mcap') as bag:
+        bag.write_hands(STAMPS[0], 'camera', [])
+    offered = {}
+    for reliability in ('recorded', 'reliable'):
+        replay = play(tmp_path / 'lossy.mcap', reliability=reliability)
+        [publisher] = replay._outputs.values()
+        offered[reliability] = publisher.qos_profile.reliability
+    assert offered == {'recorded': ReliabilityPolicy.BEST_EFFORT, 'reliable': ReliabilityPolicy.RELIABLE}
 
 
 def test_topics_that_are_not_there_are_named(bag, listener, play):

@@ -672,6 +672,8 @@ def test_a_refiner_learns_from_what_its_base_has_not_seen(folder, tmp_path):
     base = tmp_path / 'base' / 'last.safetensors'
     with pytest.raises(TrainingError, match='choose one of std_ref, or_ref'):
         tiny(folder, 'refiner=deep', f'base={base}', out=tmp_path / 'never')
+    with pytest.raises(TrainingError, match=r'or_ref corrects .* --set refiner=or_ref'):
+        tiny(folder, 'network=or_ref', 'options={}', out=tmp_path / 'never')
     with pytest.raises(TrainingError, match=r'gives joints of hand21, but icvl has those of icvl16'):
         tiny(folder, 'refiner=or_ref', 'base=deep_prior', out=tmp_path / 'never')
     with pytest.raises(HandPoseError, match='does not take width'):

@@ -93,6 +93,9 @@ def _make_network(recipe: Recipe, base: Checkpoint | None, skeleton: Skeleton) -
     """With fresh weights, but for the first of two looks."""
     if recipe.first and recipe.network != 'two_looks':
         raise TrainingError(f'--set first=FILE is for --set network=two_looks, and {recipe.network} has one look')
+    if recipe.network in REFINERS:
+        raise TrainingError(f'{recipe.network} corrects the joints of another network: train it with '
+                            f'--set refiner={recipe.network} --set base=FILE, and leave out --set network')
     if (recipe.network == 'hand_finder') != (recipe.dataset == 'scenes'):
         raise TrainingError(f'{recipe.network} cannot learn from {recipe.dataset}: hand_finder, and nothing else, '
                             'is trained with dataset=scenes')

@@ -701,6 +701,12 @@ def test_a_refiner_learns_from_what_its_base_has_not_seen(folder, tmp_path):
         tiny(folder, 'refiner=or_ref', out=tmp_path / 'never')
 
 
+def test_a_base_without_joints_is_refused_as_that_of_a_refiner(folder, tmp_path):
+    tiny(folder, 'network=center_refiner', 'options={}', 'last_shard=2', 'samples=4', out=tmp_path / 'palm').train()
+    with pytest.raises(TrainingError, match='is a center_refiner, which gives no joints to correct'):
+        tiny(folder, 'refiner=or_ref', f'base={tmp_path / "palm" / "last.safetensors"}', out=tmp_path / 'never')
+
+
 def test_the_center_refiner_learns_where_the_palm_is(folder, tmp_path):
     run = tiny(folder, 'network=center_refiner', 'options={}', 'options.dropout=0.0', 'optimizer=adamw',
                'learning_rate=0.001', 'samples=600', out=tmp_path)

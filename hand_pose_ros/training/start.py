@@ -15,6 +15,7 @@ from hand_pose_ros.models.checkpoints import Checkpoint, load_checkpoint
 from hand_pose_ros.models.dense import ADDED, HandDense
 from hand_pose_ros.models.prior import fit_prior
 from hand_pose_ros.models.two_looks import TwoLooks
+from hand_pose_ros.runtime import NO_JOINTS
 from hand_pose_ros.skeleton import Skeleton
 from hand_pose_ros.training.augmentation import PRESETS, augment
 from hand_pose_ros.training.folder import TrainingError
@@ -84,6 +85,8 @@ def _refiner_objective(recipe: Recipe, base: Checkpoint | None, skeleton: Skelet
         raise TrainingError('a refiner needs the checkpoint that it corrects: --set base=FILE')
     if recipe.refiner not in REFINERS:
         raise TrainingError(f'--set refiner={recipe.refiner}: choose one of {", ".join(REFINERS)}')
+    if (first := vars(base.network)['architecture']) in NO_JOINTS:
+        raise TrainingError(f'{recipe.base} is a {first}, which gives no joints to correct: choose another base')
     options = {name: value for name, value in recipe.options.items() if name != 'bottleneck'}  # which no refiner has
     refiner = build(recipe.refiner, **options | {'joints': len(skeleton)})
     return RefinerObjective(refiner, base.network, recipe, skeleton)

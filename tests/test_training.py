@@ -825,6 +825,11 @@ def test_the_second_look_learns_behind_a_first_which_stays(folder, tmp_path):
     trained, kept = load_checkpoint(last).network.state_dict(), load_checkpoint(small).network.state_dict()
     assert all(torch.equal(trained[f'first.{name}'], value) for name, value in kept.items())
     assert not torch.equal(trained['second.maps.weight'], base['maps.weight'])
+    # What the first has seen, both have: a refiner of them begins behind that.
+    save_checkpoint(small, load_checkpoint(small).network, {**facts, 'training_data': 'icvl-train',
+                                                            'training_shards': 3, 'recipe': {'shard_size': 4}})
+    tiny(folder, *wanted, f'first={small}', 'last_shard=2', 'samples=4', out=tmp_path / 'behind').train()
+    assert load_checkpoint(tmp_path / 'behind' / 'last.safetensors').metadata['training_shards'] == 3
     # And on, from two looks; or with another first.
     again = tiny(folder, *wanted, f'base={last}', out=tmp_path / 'again').objective.network.state_dict()
     assert all(torch.equal(value, trained[name]) for name, value in again.items())

@@ -106,9 +106,12 @@ class Run:
         if recipe.last_shard is not None and self.shards.dataset.size is None:
             raise TrainingError(f'--set last_shard={recipe.last_shard} is for recorded datasets: {recipe.dataset} '
                                 'has no end; --set samples=N says how much of it is seen')
-        first = first_shard(recipe, self.base, self.shards.dataset)
-        self.stream = SampleStream(self.shards, recipe.batch_size, recipe.seed, recipe.reuse, first, recipe.last_shard,
+        begin = first_shard(recipe, self.base, self.shards.dataset)
+        self.stream = SampleStream(self.shards, recipe.batch_size, recipe.seed, recipe.reuse, begin, recipe.last_shard,
                                    (self.rank, self.world))
+        first = load_checkpoint(recipe.first) if recipe.first else None
+        # What they have seen, the new weights have seen.
+        self._seen = max(shards_seen(recipe, each, self.shards.dataset) for each in (self.base, first))
         self.budget = recipe.samples or recipe.epochs * (self.stream.epoch_size or EPOCH_OF_ENDLESS_DATA)
         self.steps = -(-self.budget // recipe.batch_size)
 
@@ -337,8 +340,7 @@ class Run:
             return some_samples(shards, self.recipe.val_samples)
 
     def _save_checkpoint(self, name: str, result: dict[str, Any]) -> None:
-        # What the base has seen, these weights have seen.
-        shards = max(self.stream.shards_used(self.step), shards_seen(self.recipe, self.base, self.shards.dataset))
+        shards = max(self.stream.shards_used(self.step), self._seen)
         metadata = {'skeleton': self.skeleton.name, 'cube_side': self.shards.dataset.cube_side, 'validation': result,
                     'samples': self.step * self.recipe.batch_size, 'recipe': recipe_to_dict(self.recipe),
                     'training_data': self.shards.dataset.name, 'training_shards': shards}

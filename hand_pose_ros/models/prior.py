@@ -48,7 +48,8 @@ def fit_prior(poses: ArrayLike, components: int = 30) -> PosePrior:
     poses = poses.reshape(len(poses), -1)
     if min(poses.shape) < components:
         raise HandPoseError(f'{components} components need at least as many poses and coordinates, '
-                            f'but there are {poses.shape[0]} poses of {poses.shape[1]} coordinates')
+                            f'but there are {poses.shape[0]} poses of {poses.shape[1]} coordinates: choose fewer '
+                            '(--set options.bottleneck=N), or give more poses')
     if not np.isfinite(poses).all():
         raise HandPoseError('the poses for the prior hold values that are not finite')
     mean = poses.mean(0)

@@ -4,8 +4,8 @@
     python examples/gripper.py --ros-args -r gripper/commands:=/gripper_controller/commands -p max_opening:=0.08
 
 It listens to the node: start that first, as for examples/subscribe.py. The command is the opening in metres, as a
-forward_command_controller takes it. Without a hand that can be trusted the gripper stays as it is. It is taken to be
-open at the start: open it before.
+forward_command_controller takes it. Of several hands it follows one until that is gone, and then the likeliest. Without
+a hand that can be trusted the gripper stays as it is. It is taken to be open at the start: open it before.
 """
 
 import numpy as np
@@ -37,6 +37,7 @@ class Gripper(Node):
         super().__init__('gripper')
         self.max_opening = self.declare_parameter('max_opening', 0.08).value
         self.opening, self.moved = self.max_opening, self.get_clock().now()
+        self.followed = ''  # id of a hand
         self.commands = self.create_publisher(Float64MultiArray, 'gripper/commands', 10)
         self.create_subscription(HandJointsArray, 'hand/joints', self.on_hands, 10)
 
@@ -45,9 +46,11 @@ class Gripper(Node):
             self.get_logger().error(f"hand/joints has the joints of '{message.skeleton}': start the node with a model "
                                     'of hand21, such as the default', once=True)
             return
-        hand = max(message.hands, key=lambda hand: hand.score, default=None)
+        # Scores of two hands are nearly the same: by them alone, it would follow now one, now the other.
+        hand = max(message.hands, key=lambda hand: (hand.id == self.followed, hand.score), default=None)
         if hand is None or hand.score < MIN_SCORE or hand.side not in SIDES:
             return
+        self.followed = hand.id
         joints = np.array([(point.x, point.y, point.z) for point in hand.joints])
         wanted = self.max_opening * (1 - closing(joints, SIDES[hand.side]))
         now = self.get_clock().now()

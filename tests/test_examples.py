@@ -243,6 +243,24 @@ def test_gripper_keeps_its_speed_from_the_first_command_on_and_when_the_clock_st
     np.testing.assert_allclose(gripper.openings, [0.08, 0.06, 0.06, 0.04], atol=1e-6)
 
 
+def test_gripper_follows_one_of_two_hands_until_it_is_gone(gripper: Any) -> None:
+    from rclpy.clock import ClockType
+    from rclpy.time import Time
+    both = hands_message(pose())
+    both.hands += hands_message(pose(mcp_flexion=80, pip_flexion=95, dip_flexion=55)).hands
+    both.hands[1].id = 'hand_2'
+    for tenths in range(1, 7):
+        gripper.get_clock().set_ros_time_override(Time(seconds=tenths / 10, clock_type=ClockType.ROS_TIME))
+        both.hands[0].score, both.hands[1].score = (0.99, 0.98) if tenths % 2 else (0.98, 0.99)
+        gripper.on_hands(both)
+    open_wide = gripper.openings[-1]
+    assert open_wide > 0.09 and min(gripper.openings) == pytest.approx(open_wide), 'the other is a fist'
+    del both.hands[0]
+    gripper.get_clock().set_ros_time_override(Time(seconds=0.7, clock_type=ClockType.ROS_TIME))
+    gripper.on_hands(both)
+    assert gripper.openings[-1] < open_wide - 0.01
+
+
 def test_gripper_says_once_that_it_needs_the_joints_of_hand21(gripper: Any, capfd: pytest.CaptureFixture[str]) -> None:
     for _ in range(2):
         gripper.on_hands(hands_message(pose(), skeleton='msra21'))

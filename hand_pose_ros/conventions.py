@@ -6,6 +6,8 @@ from typing import Any
 
 TRANSPORTS = ('raw', 'compressedDepth', 'compressed')
 """The better one first. All but raw have a topic below that of the image (image_transport)."""
+CROP = 'debug/crop'
+"""Below the name of the node: what the network sees, which has the encoding of depth and is none."""
 
 
 def split_transport(topic: str) -> tuple[str, str]:

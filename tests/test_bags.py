@@ -175,6 +175,15 @@ def test_of_several_depth_topics_one_must_be_chosen(tmp_path, depths):
         DepthBag(tmp_path / 'two.mcap', depth_topic='/middle/image')
 
 
+def test_a_crop_that_the_node_published_is_no_depth(tmp_path, depths):
+    """It is recorded where everything is, and whoever trains on bags cannot choose a topic."""
+    with BagWriter(tmp_path / 'all.mcap') as bag:
+        for topic in ('/estimator/debug/crop', f'/{BASE}'):
+            bag.write_depth(STAMPS[0], 'camera', depths[0], CAMERA, topic=topic, codec=None)
+    with DepthBag(tmp_path / 'all.mcap') as bag:
+        assert bag.depth_topic == f'/{BASE}'
+
+
 def test_transports_of_one_image_are_one_topic(tmp_path, depths):
     with BagWriter(tmp_path / 'both.mcap') as bag:
         for codec in (None, 'png'):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rosbags.interfaces import Connection
 
 from hand_pose_ros.bags.bag import CAMERA_INFO, COMPRESSED_IMAGE, HANDS, IMAGE, SIDES, Bag
-from hand_pose_ros.conventions import TRANSPORTS, camera_info_beside, join_transport, split_transport, stamp_ns
+from hand_pose_ros.conventions import CROP, TRANSPORTS, camera_info_beside, join_transport, split_transport, stamp_ns
 from hand_pose_ros.depth import DEPTH_ENCODINGS, decode_compressed, decode_image
 from hand_pose_ros.errors import InputError, naming
 from hand_pose_ros.geometry import Intrinsics
@@ -151,6 +151,8 @@ class DepthBag(Bag):
                          f'compressedDepth do: choose another bag (this one has {self._topics()})')
 
     def _carries_depth(self, connection: Connection) -> bool:
+        if connection.topic.endswith(f'/{CROP}'):  # recorded with all that the node publishes
+            return False
         if connection.msgtype not in (IMAGE, COMPRESSED_IMAGE) or (message := self.first(connection)) is None:
             return False
         described = message.encoding if connection.msgtype == IMAGE else message.format.replace(';', ' ')

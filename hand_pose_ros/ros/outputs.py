@@ -14,6 +14,7 @@ from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
+from hand_pose_ros.conventions import CROP
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.estimator import HandEstimate, HandPoseEstimator
 from hand_pose_ros.geometry import Intrinsics, crop
@@ -46,7 +47,7 @@ class Outputs:
         self._joints_pub = self._create(HandJointsArray, 'hand/joints')
         self._markers_pub = self._create(MarkerArray, 'hand/markers')
         self._skeleton_pub = self._create(HandSkeleton, 'hand/skeleton', qos.LATCHED)
-        self._crop_pub = self._create(Image, '~/debug/crop')
+        self._crop_pub = self._create(Image, f'~/{CROP}')
         self._poses_pub = self._create(PoseArray, 'hand/poses') if params.publish_poses else None
         self._states_pub = self._create(JointState, 'hand/joint_states') if params.publish_joint_states else None
         self._tf_pub = self._create(tf, '/tf', qos.TF) if tf else None

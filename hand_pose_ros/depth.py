@@ -1,8 +1,8 @@
 """Bytes of a depth image -> depth in metres, float32, where 0 means "no reading".
 
 Understood are the encodings 16UC1, mono16 and 32FC1 (REP-118) of sensor_msgs/Image, the transports
-`compressedDepth` (PNG and RVL) and plain `compressed` (16-bit PNG) of sensor_msgs/CompressedImage, and 16-bit PNG
-files. Messages are taken by their fields: those of rclpy, of a bag reader, or any object with the same attributes.
+`compressedDepth` (PNG and RVL) and plain `compressed` (16-bit PNG, TIFF) of sensor_msgs/CompressedImage, and 16-bit
+PNG files. Messages are taken by their fields: those of rclpy, of a bag reader, or any object with the same attributes.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ def decode_compressed(msg: Any, depth_scale: float = 0.001, *, source: str = '')
 
     Args:
         msg: `format` and `data` (any buffer). Formats: `16UC1; compressedDepth png`, `... rvl`, without the
-            codec (png), with nothing after the encoding (png), and `16UC1; png compressed` of the plain
-            `compressed` transport; 32FC1 is inverse depth, quantised to 16 bits.
+            codec (png), with nothing after the encoding (png), and `16UC1; png compressed` and `...; tiff compressed`
+            of the plain `compressed` transport; 32FC1 is inverse depth, quantised to 16 bits, but metres in TIFF.
         depth_scale: metres per unit of the 16-bit encodings.
         source: the topic or file, to begin error messages with.
 
@@ -83,10 +83,10 @@ def decode_compressed(msg: Any, depth_scale: float = 0.001, *, source: str = '')
         if encoding not in DEPTH_ENCODINGS:
             raise InputError(f'the format {msg.format!r:.80} is not compressed depth: choose a topic whose format '
                              f"begins with {', '.join(DEPTH_ENCODINGS)} (such as '16UC1; compressedDepth png')")
-        if 'tiff' in words:
-            raise InputError(f'the format {msg.format!r:.80} is TIFF, which is not read: take the raw image or '
-                             'compressedDepth, or have PNG published (kinect2_bridge: use_png:=true)')
         data = memoryview(msg.data).cast('B')
+        if 'tiff' in words:
+            pixels = _decode_tiff(data, DEPTH_ENCODINGS[encoding])
+            return to_metres(pixels, depth_scale) if pixels.dtype.kind == 'u' else _sanitised(pixels)
         plain = bytes(data[:8]) == _PNG_SIGNATURE  # the `compressed` transport writes no header
         if DEPTH_ENCODINGS[encoding].kind == 'u':
             return to_metres(_decode_units(data[0 if plain else _HEADER.size:], words), depth_scale)
@@ -259,13 +259,36 @@ def _decode_png(data: memoryview) -> NDArray[np.uint16]:
     while end + 8 <= len(data) and kind != b'IEND':  # OpenCV makes room for a chunk of whatever length it claims
         length, kind = struct.unpack_from('>I4s', data, end)
         end += length + 12
+    return _imdecode(data if end <= len(data) else data[:0], 'PNG', (height, width), np.dtype('u2'))
+
+
+def _decode_tiff(data: memoryview, pixel: np.dtype[Any]) -> NDArray[Any]:
+    """(H, W) pixels of that type; as of a PNG, the header is checked first."""
+    sizes = {}
     try:
-        units = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if end <= len(data) else None
+        order = {b'II': '<', b'MM': '>'}[bytes(data[:2])]
+        start, = struct.unpack_from(order + 'I', data, 4)
+        entries, = struct.unpack_from(order + 'H', data, start)
+        for at in range(start + 2, start + 2 + 12 * entries, 12):
+            tag, kind = struct.unpack_from(order + 'HH', data, at)
+            if tag in (256, 257):  # width, height: 16 or 32 bits
+                sizes[tag], = struct.unpack_from(order + ('H' if kind == 3 else 'I'), data, at + 8)
+        width, height = sizes[256], sizes[257]
+    except (KeyError, struct.error):
+        raise InputError('the data is not a TIFF: the message was cut short or is of another format') from None
+    _check_size(width, height)
+    return _imdecode(data, 'TIFF', (height, width), pixel)
+
+
+def _imdecode(data: memoryview, kind: str, shape: tuple[int, int], pixel: np.dtype[Any]) -> NDArray[Any]:
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if len(data) else None
     except cv2.error:
-        units = None
-    if units is None or units.dtype != np.uint16 or units.shape != (height, width):
-        raise InputError(f'the PNG of {width}x{height} pixels is damaged: record or copy it again')
-    return np.asarray(units, np.uint16)
+        pixels = None
+    if pixels is None or pixels.dtype != pixel or pixels.shape != shape:
+        raise InputError(f'the {kind} of {shape[1]}x{shape[0]} pixels is damaged, or not of one channel of '
+                         f'{8 * pixel.itemsize} bits: record or copy it again')
+    return pixels
 
 
 def _check_scale(depth_scale: float) -> None:

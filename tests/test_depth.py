@@ -40,6 +40,10 @@ def compressed(form, payload, header=b'\0' * 12):
     return SimpleNamespace(format=form, data=header + payload)
 
 
+def tiff(pixels):
+    return cv2.imencode('.tif', pixels)[1].tobytes()
+
+
 @pytest.fixture
 def units():
     noise = np.random.default_rng(5).integers(400, 5000, (48, 65)).astype(np.uint16)
@@ -125,6 +129,14 @@ def test_png_without_header(units, form):
         np.testing.assert_array_equal(depth, decode_image(image(units)))
 
 
+def test_tiff_as_kinect2_bridge_compresses_depth(units):
+    depth = decode_compressed(compressed('16UC1; tiff compressed', tiff(units), b''))
+    np.testing.assert_array_equal(depth, decode_image(image(units)))
+    metres = np.where(units == 7, np.nan, units / 1000).astype(np.float32)
+    depth = decode_compressed(compressed('32FC1; tiff compressed', tiff(metres), b''))
+    np.testing.assert_array_equal(depth, np.nan_to_num(metres))
+
+
 def test_other_codecs_are_refused():
     with pytest.raises(InputError, match="unknown codec 'jpg'"):
         encode_compressed(np.ones((4, 4), np.float32), 'jpg')
@@ -161,8 +173,13 @@ def test_inverse_depth_of_32fc1(encode):
 @pytest.mark.parametrize(('message', 'says'), [
     (compressed('rgb8; jpeg compressed bgr8', b'\xff\xd8'), 'rgb8; jpeg'),
     (compressed('', b''), "format ''"),
-    (compressed('16UC1; tiff compressed', cv2.imencode('.tif', np.ones((4, 4), np.uint16))[1].tobytes(), b''), 'TIFF'),
-    (compressed('32FC1; tiff compressed', cv2.imencode('.tif', np.ones((4, 4), np.float32))[1].tobytes(), b''), 'TIFF'),
+    (compressed('16UC1; tiff compressed', tiff(np.ones((4, 4), np.float32)), b''), 'TIFF of 4x4 .* 16 bits'),
+    (compressed('32FC1; tiff compressed', tiff(np.ones((4, 4), np.uint16)), b''), 'TIFF of 4x4 .* 32 bits'),
+    (compressed('16UC1; tiff compressed', tiff(np.ones((4, 4, 3), np.uint16)), b''), 'not of one channel'),
+    (compressed('16UC1; tiff compressed', tiff(np.ones((4, 4), np.uint16))[:30], b''), 'not a TIFF'),
+    (compressed('16UC1; tiff compressed', encode_png(np.ones((4, 4), np.uint16)), b''), 'not a TIFF'),
+    (compressed('16UC1; tiff compressed', b'II*\0' + struct.pack(
+        '<IH' + 2 * 'HHII', 8, 2, 256, 4, 1, 1 << 30, 257, 4, 1, 1 << 30), b''), 'claims'),
     (compressed('16UC1; compressedDepth png', b''), 'not a PNG'),
     (compressed('16UC1; compressedDepth png', b'', b''), 'not a PNG'),
     (compressed('16UC1; compressedDepth png', encode_png(np.ones((4, 4), np.uint16))[:20]), 'not a PNG'),

@@ -68,6 +68,15 @@ def test_report_is_one_file_that_needs_nothing_else(result, tmp_path):
         f'{name}.{form}' for name in ('curves', 'joints', 'errors', 'latency') for form in ('png', 'svg'))}
     for image in path.parent.glob('*.png'):
         assert cv2.imread(str(image)).std() > 10
+    predict, total = (summary['latency_ms'][stage] for stage in ('predict', 'total'))
+    assert tiles(html) == {
+        'mean error': f'{summary["mean_mm"]:.1f} mm', 'median of joints': f'{summary["median_mm"]:.1f} mm',
+        'frames within 40 mm': f'{100 * summary["within_mm"]["40"]:.1f} %',
+        'area under the curve': f'{summary["auc_0_80"]:.3f}', 'hands found': '97.5 %', 'frames per second': '321',
+        'latency, 99th percentile': f'{total["p99"]:.1f} ms', 'jitter': f'{summary["error_jitter_mm"]:.1f} mm'}
+    cells = [f'{predict[key]:.2f}' for key in ('mean', 'p50', 'p90', 'p99', 'max')]
+    for row in (['predict', *cells, f'{100 * predict["mean"] / total["mean"]:.0f} %'], ['model', 'm']):
+        assert ''.join(f'<td>{cell}</td>' for cell in row) in html.replace(' class="text"', '')
 
 
 def test_report_shows_the_best_median_and_worst_frame(result, tmp_path):
@@ -79,6 +88,7 @@ def test_report_shows_the_best_median_and_worst_frame(result, tmp_path):
         ('Best', order[0]), ('Median', order[19]), ('Worst', order[-1])]
     views = json.loads(re.search(r'id="frames">(.*?)</script>', html)[1])['views']
     assert len(views) == 3 and all(len(view['cloud']) > 600 and len(view['estimate']) == 21 for view in views)
+    assert all(np.mean(view['truth'], axis=0) == pytest.approx(0, abs=0.1) for view in views), 'the truth in the middle'
     gap = np.linalg.norm(np.subtract(views[2]['estimate'], views[2]['truth']), axis=1).mean()
     assert gap == pytest.approx(means[order[-1]], abs=0.1), 'the view has the scale of the world'
 
@@ -87,7 +97,11 @@ def test_report_without_truth_shows_times_and_first_middle_last(result, tmp_path
     blind = Result('b', HAND21, CAMERA, result.predictions, stamps_ns=result.stamps_ns, seconds=result.seconds)
     html = write_report([blind], tmp_path).read_text()
     assert re.findall(r'<h3>(\w+): frame (\d+)</h3>', html) == [('First', '1'), ('Middle', '21'), ('Last', '40')]
-    assert 'latency, 99th percentile' in html and 'Accuracy' not in html
+    assert 'Accuracy' not in html
+    assert list(tiles(html)) == ['hands found', 'latency, 99th percentile', 'jitter']
+    assert tiles(html)['jitter'] == f'{blind.summary()["jitter_mm"]:.1f} mm'
+    live = replace(blind, seconds={'image to joints': blind.seconds['total']})  # the node tells no stages
+    assert 'latency, 99th percentile' in tiles(write_report([live], tmp_path).read_text())
 
 
 def test_notes_of_all_results_are_told(result, tmp_path):
@@ -123,8 +137,29 @@ def test_curves_show_what_the_metrics_say(result):
     for axes, curve in ((left, metrics.success_curve), (right, metrics.pck)):
         line = axes.lines[0]
         assert line.get_ydata() == pytest.approx(100 * curve(result.errors_mm, line.get_xdata()))
-    bars = [bar.get_height() for bar in plots.joint_bars([result]).axes[0].patches]
-    assert bars == pytest.approx(metrics.per_joint_mm(result.errors_mm))
+    auc, mean = metrics.auc(result.errors_mm), metrics.mean_mm(result.errors_mm)
+    assert legends(plots.curves([result])) == [f' {result.name}   AUC {auc:.3f}, mean {mean:.1f} mm']
+    bars = plots.joint_bars([result, replace(result, predictions=result.truth)]).axes[0].patches
+    assert [bar.get_height() for bar in bars] == pytest.approx([*metrics.per_joint_mm(result.errors_mm), *[0] * 21])
+    assert [bar.get_center()[0] for bar in bars] == pytest.approx([*(np.arange(21) - 0.2), *(np.arange(21) + 0.2)])
+
+
+def test_errors_and_times_are_drawn_where_they_were(result):
+    seconds = {**result.seconds, 'decode': np.full(40, np.nan)}  # a stage that did not run
+    parted = replace(result, parts={'first': (0, 20), 'second': (20, 40)}, seconds=seconds,
+                     stamps_ns=result.stamps_ns + 10 ** 18)
+    at, errors = 0.033 * np.arange(40), result.errors_mm
+    (axes,) = plots.over_time(parted).axes
+    lines = {line.get_label(): line.get_xydata().T for line in axes.lines}
+    for label, expected in (('mean of joints', metrics.frame_means_mm(errors)), ('worst joint', errors.max(axis=1))):
+        np.testing.assert_allclose(lines[label], [at, np.where(np.arange(40) == 7, np.nan, expected)])
+    assert lines['missed'][0] == pytest.approx(at[7:8]) and axes.get_ylim()[1] > errors[np.isfinite(errors)].max()
+    assert [text.get_text() for text in axes.texts] == ['first', 'second']
+    starts = [text.xy[0] for text in axes.texts]
+    assert starts == [line.get_xdata()[0] for line in axes.lines[-2:]] == pytest.approx(at[[0, 20]])
+    (axes,) = plots.latency(parted).axes
+    tops = [area.get_paths()[0].vertices[:, 1].max() for area in axes.collections]
+    assert tops == pytest.approx([1000 * seconds['predict'].max()] * 2) and axes.get_xlabel() == 'time, s'
 
 
 def test_labels_scored_as_predictions_are_drawn_at_zero(result):
@@ -191,6 +226,11 @@ def test_many_results_with_long_names_can_be_told_apart(result):
             assert not around.overlaps(inside) and around.height > figure.bbox.height / 5, 'no curve is covered'
     lines = plots.curves(many).axes[0].lines
     assert len({(line.get_color(), line.get_linestyle()) for line in lines}) == 20
+
+
+def tiles(html):
+    """What the tiles at the head of a report say."""
+    return {label: value for value, label in re.findall(r'<b>([^<]*)</b><span class="soft">([^<]*)</span>', html)}
 
 
 def legends(figure):

@@ -1,5 +1,6 @@
 """What the generator of synthetic hands promises to those who train on it."""
 
+import math
 import shutil
 
 import cv2
@@ -225,6 +226,57 @@ def test_full_frame_and_moving_hand():
     assert not np.array_equal(frames[0][0], frames[1][0])
     again = list(one.sequence(3, 4))
     assert np.array_equal(again[2][0], frames[2][0])
+
+
+def test_full_frames_show_the_samples_of_the_batch(hands, batch):
+    for side, name in enumerate(('left', 'right'), start=LEFT):
+        index = int(((batch['side'] == side) & batch['hand_present']).nonzero()[0])
+        *_, joints, shown = hands.full_frame(index)
+        assert shown == name
+        np.testing.assert_allclose(joints, batch['joints_m'][index].numpy(), atol=1e-6)
+
+
+def test_a_hand_moves_softly_between_poses_in_a_scene_that_stands_still():
+    noisy, clean = (SyntheticHands('train', sensors=['pmd'], ingredients=Ingredients(noise=noise))
+                    for noise in (True, False))
+    *_, joints, side = clean.full_frame(61)
+    assert side == 'none' and not joints.any(), 'a sample without a hand'
+    depths, _, joints, sides = zip(*clean.sequence(61, 9, frames_per_key=4), strict=True)
+    assert set(sides) <= {'left', 'right'}, 'has one in motion'
+    at = np.mean(joints, axis=1)
+    for key in (0, 4):
+        begun = (at[key + 1] - at[key]) / (at[key + 2] - at[key])
+        np.testing.assert_allclose(begun, 1 - math.cos(math.pi / 4), atol=1e-3)
+    assert np.linalg.norm(at[8] - at[0]) > 0.005, 'and goes on to a third place'
+    still = depths[0] == depths[8]
+    assert still.mean() > 0.75
+    first, second = (depth for depth, *_ in noisy.sequence(61, 2, frames_per_key=4))
+    assert (first != second)[still].mean() > 0.1, 'the noise does not stand still'
+
+
+def test_whole_scenes_say_where_both_hands_are():
+    kinect = SyntheticHands('train', sensors=['kinect2'], ingredients=Ingredients(noise=False), chunk=CHUNK)
+    scenes = kinect.scenes(torch.arange(2 * CHUNK), 364.5 / 4, 160, 120)  # 128 x 106 pixels of the sensor in each
+    depth, hands, shown = (scenes[name].numpy() for name in ('depth', 'hands', 'shown'))
+    assert shown[:, 0].sum() > 40 and 2 < shown[:, 1].sum() < 8 and not hands[~shown].any()
+    for number in 0, 1:
+        rows = shown[:, number].nonzero()[0]
+        u, v = hands[rows, number, :2].round().astype(int).T
+        assert np.median(np.abs(depth[rows, v, u] - hands[rows, number, 2])) < 0.05
+    columns, rows = (np.where(depth.any(axis), 1, 0) for axis in (1, 2))
+    for lit, size in ((columns, 128), (rows, 106)):
+        extent = lit.shape[1] - lit[:, ::-1].argmax(1) - lit.argmax(1)
+        assert extent.max() == size, 'nothing is beside the image of the sensor'
+    moved = []
+    for index in range(6):
+        _, camera, joints, side = kinect.full_frame(index)
+        u, v = camera.project(joints.mean(0))
+        u = camera.width - 1 - u if side == 'left' else u  # scenes are those of right hands
+        moved.append(hands[index, 0, :2] - ((np.array([u, v]) + 0.5) / 4 - 0.5))
+        assert hands[index, 0, 2] == pytest.approx(joints.mean(0)[2], abs=1e-5)
+    np.testing.assert_allclose(moved, np.round(moved), atol=1e-2)
+    assert np.min(moved) > -0.1 and (np.max(moved, axis=0) < [32.1, 14.1]).all()
+    assert (np.ptp(moved, axis=0) > 3).all(), 'the window is anywhere'
 
 
 def test_another_skin_has_the_joints_of_its_rig(shared_data):

@@ -96,6 +96,9 @@ def test_a_folder_of_pngs_into_arrays_and_pictures(tmp_path, folder, command, ex
     np.testing.assert_allclose(result['joints'], [hand.joints for hand in hands], atol=1e-6)
     np.testing.assert_allclose(result['confidence'], [hand.confidence for hand in hands], atol=1e-4)
     np.testing.assert_allclose(result['cube_center'], [hand.cube.center for hand in hands], atol=1e-6)
+    np.testing.assert_allclose(result['cube_side'], [hand.cube.side for hand in hands], atol=1e-6)
+    np.testing.assert_allclose(result['score'], [hand.score for hand in hands], atol=1e-4)
+    assert result['stamp_ns'].tolist() == [33_333_333 * i for i in range(6)], '30 Hz'
     assert result['side'].tolist() == [hand.side for hand in hands] and set(result['id']) == {'hand_1'}
     assert tuple(result['joint_names']) == HAND21.joint_names and str(result['skeleton']) == 'hand21'
     assert sorted(path.stem for path in (tmp_path / 'pictures').iterdir()) == sorted(result['names'])

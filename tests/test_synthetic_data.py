@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from hand_pose_ros.bags import DepthBag
+from hand_pose_ros.bags import DepthBag, read_hands
 from hand_pose_ros.cli import main
 from hand_pose_ros.detection import detect
 from hand_pose_ros.geometry import Cube, Intrinsics
@@ -208,6 +208,9 @@ def test_each_ingredient_can_be_left_out(without, batch):
     assert not torch.equal(plain[changed], batch[changed][:8])
     if without != 'poses':
         assert torch.equal(plain['joints_m'], batch['joints_m'][:8]), 'the same hands'
+    if without == 'detector':
+        torch.testing.assert_close(plain['joints_m'].mean(1)[plain['hand_present']],
+                                   plain['cube_center'][plain['hand_present']])
 
 
 def test_full_frame_and_moving_hand():
@@ -301,6 +304,13 @@ def test_command_line_shows_writes_and_measures(tmp_path, capsys, shared_data):
     assert main(['synth', 'record', str(tmp_path / 'raw.mcap'), '--number', '2', '--raw']) == 0
     with DepthBag(tmp_path / 'raw.mcap') as bag:
         assert bag.depth_topic == '/depth/image_rect' and len(bag) == 2
+        truth = read_hands(tmp_path / 'raw.mcap', '/truth/joints')
+        for i, (image, hand, (depth, camera, joints, side)) in enumerate(zip(
+                bag, truth, SyntheticHands('train').sequence(0, 2), strict=True), start=1):
+            assert image.stamp_ns == hand.stamp_ns == i * 10 ** 9 // 30 and image.frame_id == hand.frame_id
+            assert image.intrinsics == camera and hand.sides == (side,)
+            np.testing.assert_allclose(image.depth, depth, atol=0.00051)
+            np.testing.assert_allclose(hand.joints[0], joints, atol=1e-6)
     assert main(['synth', 'write', str(tmp_path / 'data'), '--number', '5', '--shard', '3', '--split', 'val']) == 0
     shards = sorted((tmp_path / 'data').iterdir())
     assert [shard.name for shard in shards] == ['val_000000000.npz', 'val_000000003.npz']

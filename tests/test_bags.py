@@ -88,6 +88,15 @@ def test_depth_and_camera_come_back_as_written(tmp_path, depths, name, codec):
     assert frames[0].topic == f'/{BASE}' + ('/compressedDepth' if codec else '')
 
 
+def test_camera_info_is_that_of_a_rectified_image(tmp_path, depths):
+    with Bag(write(tmp_path / 'bag.mcap', depths)) as bag:
+        [connection] = [one for one in bag.connections if one.topic.endswith('camera_info')]
+        info = bag.first(connection)
+    k = [300.5, 0, 31.5, 0, 301.5, 23.5, 0, 0, 1]
+    assert info.k.tolist() == k and info.p.tolist() == np.insert(k, [3, 6, 9], 0).tolist(), 'depth_image_proc reads p'
+    assert info.r.tolist() == np.eye(3).ravel().tolist() and not info.d.any()
+
+
 @pytest.mark.parametrize('codec', [None, 'png', 'rvl'])
 def test_images_come_back_as_written_in_whatever_order_they_lie_in_memory(tmp_path, depths, codec):
     assert_same(write(tmp_path / 'bag.mcap', [np.asfortranarray(depth) for depth in depths], codec), depths)
@@ -377,7 +386,8 @@ def test_markers_come_back_as_written(tmp_path):
         shown = bag.first(bag.connections[0]).markers
     for message, marker in zip(shown, markers, strict=True):
         assert (message.ns, message.type, message.action) == (marker.namespace, marker.type, marker.action)
-        assert message.header.frame_id == 'camera' and message.pose.orientation.w == 1
+        assert message.header.frame_id == 'camera' and message.pose.orientation.w == 1 and not message.frame_locked
+        assert (message.scale.x, message.scale.y, message.scale.z) == tuple(marker.scale)
         assert [(p.x, p.y, p.z) for p in message.points] == [tuple(map(float, point)) for point in marker.points]
         colors = [(c.r, c.g, c.b, c.a) for c in message.colors]
         np.testing.assert_allclose(colors, list(marker.colors), rtol=1e-6)
@@ -398,7 +408,8 @@ def test_the_skeleton_is_recorded_latched(tmp_path):
         bag.write_skeleton(STAMPS[0], 'camera', HAND21, 'a network', '1.2')
     with Bag(tmp_path / 'hands.mcap') as bag:
         [connection] = bag.connections
-        assert connection.ext.offered_qos_profiles[0].durability.name == 'TRANSIENT_LOCAL'
+        [qos] = connection.ext.offered_qos_profiles
+        assert (qos.durability.name, qos.depth) == ('TRANSIENT_LOCAL', 1)
         message = bag.first(connection)
     assert tuple(message.joint_names) == HAND21.joint_names and tuple(message.parents) == HAND21.parents
     assert (message.name, message.model, message.model_version) == ('hand21', 'a network', '1.2')

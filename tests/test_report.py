@@ -17,7 +17,7 @@ from hand_pose_ros.evaluation.published import named_apart
 from hand_pose_ros.evaluation.report import write_report
 from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.geometry import Intrinsics
-from hand_pose_ros.skeleton import HAND21
+from hand_pose_ros.skeleton import HAND21, get_skeleton
 from hand_pose_ros.training.figures import runtime
 
 CAMERA = Intrinsics(400, 400, 159.5, 119.5, 320, 240)
@@ -307,6 +307,10 @@ def test_compare_prints_tables_and_intervals(result, tmp_path, capsys):
     low, high = got['differences'][0]['interval_mm']
     assert low < -half < high < 0, 'certainly better'
     assert (tmp_path / 'plots' / 'curves.svg').is_file()
+    assert main(['compare', str(tmp_path / 'a.npz'), str(tmp_path / 'b.npz'), '--block', '10', '--json',
+                 str(tmp_path / 'c.json')]) == 0
+    wide = json.loads((tmp_path / 'c.json').read_text())['differences'][0]['interval_mm']
+    assert np.ptp(wide) > 1.2 * (high - low), 'neighbours that err alike are less to go by'
     replace(better, name=result.name).save(tmp_path / 'b.npz')  # two results of one bag have its name
     assert main(['compare', str(tmp_path / 'a.npz'), str(tmp_path / 'b.npz'), '--block', '1']) == 0
     assert 'b - a: -' in capsys.readouterr().out
@@ -353,6 +357,19 @@ def test_compare_refuses_what_cannot_be_compared(result, tmp_path, capsys):
     a, short, blind = (str(tmp_path / f'{name}.npz') for name in ('a', 'short', 'blind'))
     assert main(['compare', a, short]) == 0
     assert 'have 40 and 9 frames: no interval' in capsys.readouterr().err
+    replace(result, truth=result.truth + 0.01).save(tmp_path / 'other.npz')
+    assert main(['compare', a, str(tmp_path / 'other.npz')]) == 0
+    assert 'were evaluated on different truth: no interval' in capsys.readouterr().err
+    Result('14', get_skeleton('nyu14'), CAMERA, result.predictions[:, :14], result.truth[:, :14]).save(
+        tmp_path / '14.npz')
+    assert main(['compare', a, str(tmp_path / '14.npz'), '--out', str(tmp_path / 'plots')]) == 1
+    said = capsys.readouterr().err
+    assert 'have different joints: no interval' in said and 'joints cannot be drawn into one picture' in said
+    partly = np.where(np.arange(40)[:, None, None] < 30, result.truth, np.nan)
+    for name in 'one', 'two':
+        replace(result, name=name, truth=partly).save(tmp_path / f'{name}.npz')
+    assert main(['compare', *(str(tmp_path / f'{name}.npz') for name in ('one', 'two'))]) == 0
+    assert 'two - one: +0.000 mm, 95 % interval' in capsys.readouterr().out, 'some images have no labels'
     replace(result, predictions=np.full_like(result.predictions, np.nan)).save(tmp_path / 'lost.npz')
     assert main(['compare', a, str(tmp_path / 'lost.npz'), '--json', str(tmp_path / 'c.json')]) == 0
     assert 'have less than two frames with a hand in common' in capsys.readouterr().err

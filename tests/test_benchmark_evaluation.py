@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from hand_pose_ros.cli import main
+from hand_pose_ros.evaluation import benchmark_evaluation
 from hand_pose_ros.evaluation.benchmark_evaluation import _self_knowledge, evaluate_benchmark
 from hand_pose_ros.models import build
 from hand_pose_ros.models.checkpoints import save_checkpoint
@@ -16,7 +17,10 @@ def test_a_network_is_scored_on_the_frames_with_a_hand(tmp_path):
     torch.manual_seed(0)
     weights = tmp_path / 'net.safetensors'
     save_checkpoint(weights, build('hand_dense', width=4), {'skeleton': 'hand21', 'cube_side': 0.3})
-    result = evaluate_benchmark(str(weights), device='cpu', frames=60)
+    totals = []
+    result = evaluate_benchmark(str(weights), device='cpu', frames=60,
+                                progress=lambda items, total: totals.append(total) or items)
+    assert totals == [len(list(benchmark.frames(60, batch=50)))]
     present = int(sum(batch['hand_present'].sum() for batch in benchmark.frames(60)))
     summary = result.summary()
     assert summary['frames'] == present < 60
@@ -44,6 +48,32 @@ def test_errors_are_those_of_the_scene_also_of_left_hands(tmp_path):
     expected = scene['joints_m'].clone()
     expected[left, :, 0] *= -1
     np.testing.assert_allclose(result.truth, expected[present], atol=1e-6)
+
+
+def test_joints_are_told_apart_by_what_the_camera_sees(tmp_path, monkeypatch):
+    weights = tmp_path / 'net.safetensors'
+    save_checkpoint(weights, build('hand_dense', width=4), {'skeleton': 'hand21', 'cube_side': 0.3})
+    scene = next(iter(benchmark.frames(50, batch=50)))
+
+    class Knowing:
+        """Right but for 30 mm of depth of what is hidden, and sure of the side of what it is shown."""
+
+        name = 'knowing'
+
+        def run_full(self, patches):
+            mirrored = not np.array_equal(patches, scene['patch'])
+            np.testing.assert_array_equal(patches, scene['patch'].flip(-1) if mirrored else scene['patch'])
+            joints = scene['joints'].clone()
+            joints[..., 2] += ~scene['visible'] * 0.060 / scene['cube_side'][:, None]
+            return {'joints': joints.numpy(), 'confidence': np.zeros((50, 21)), 'hand': np.zeros(50),
+                    'side': np.full(50, not mirrored, float)}
+
+    monkeypatch.setattr(benchmark_evaluation, 'make_engine', lambda *_, **__: Knowing())
+    info = evaluate_benchmark(str(weights), device='cpu', frames=50).info
+    assert info['visible_joints']['mean_mm'] < 0.01 and info['hidden_joints']['median_mm'] == pytest.approx(30, rel=0.1)
+    [row] = info['calibration_20_mm']
+    assert row['right'] == pytest.approx(info['visible_joints']['joints'] / row['joints'], abs=1e-3)
+    assert info['side_found'] == 1
 
 
 def test_calibration_counts_what_was_right():

@@ -117,7 +117,8 @@ def test_names_of_pngs_may_be_in_capitals_and_hold_any_digit(tmp_path, folder, c
 
 
 def test_a_bag_into_a_bag(tmp_path, bag, command, expected):
-    assert command(bag, '--out', tmp_path / 'joints.mcap') == 0
+    assert command(bag, '--out', tmp_path / 'joints.mcap', '--overlay', tmp_path / 'pictures') == 0
+    assert sorted(path.name for path in (tmp_path / 'pictures').iterdir()) == [f'{i:06d}.png' for i in range(6)]
     recorded = read_hands(tmp_path / 'joints.mcap')
     assert [record.stamp_ns for record in recorded] == STAMPS
     assert {record.frame_id for record in recorded} == {'camera_optical'}
@@ -126,6 +127,33 @@ def test_a_bag_into_a_bag(tmp_path, bag, command, expected):
     with Bag(tmp_path / 'joints.mcap') as result:
         counts = {connection.topic: connection.msgcount for connection in result.connections}
     assert counts['/hand/joints'] == 6 and counts['/hand/skeleton'] == 1
+
+
+def test_as_many_hands_of_an_image_as_are_asked_for(tmp_path, weights, capsys):
+    v, u = np.mgrid[:120, :160]
+    discs = np.minimum(np.hypot(u - 30, v - 60), np.hypot(u - 130, v - 60)) < 12
+    cv2.imwrite(str(tmp_path / '0.png'), np.where(discs, 700, 3000).astype(np.uint16))
+    for number in 1, 2:
+        assert main(['estimate', str(tmp_path / '0.png'), *INTRINSICS, '--out', str(tmp_path / 'joints.npz'), '--model',
+                     str(weights), '--min-score', '0', '--detector', 'nearest', '--max-hands', str(number)]) == 0
+        assert np.load(tmp_path / 'joints.npz')['frame'].tolist() == [0] * number
+        assert '1 image, 1 with a hand' in capsys.readouterr().out
+
+
+def test_what_is_said_of_hand_and_camera_is_taken(tmp_path, depths, command):
+    other = Intrinsics(200.0, 200.0, 70.0, 50.0, 160, 120)
+    with BagWriter(tmp_path / 'two.mcap') as writer:
+        for name, camera in (('a', CAMERA), ('b', other)):
+            writer.write_depth(STAMPS[0], 'camera', depths[0], camera, topic=f'/{name}/depth', codec=None)
+    results = []
+    for camera in (('--camera-info-topic', '/b/camera_info'), ('--intrinsics', '200', '200', '70', '50'), ()):
+        assert command(tmp_path / 'two.mcap', '--depth-topic', '/a/depth', *camera, '--side', 'left', '--cube-size',
+                       '0.2', '--out', tmp_path / 'joints.npz') == 0
+        results.append(dict(np.load(tmp_path / 'joints.npz')))
+    topic, numbers, own = results
+    np.testing.assert_allclose(topic['joints'], numbers['joints'], atol=1e-6)
+    assert np.abs(topic['joints'] - own['joints']).max() > 0.01
+    assert own['side'].tolist() == ['left'] and own['cube_side'] == pytest.approx([0.2])
 
 
 @pytest.mark.parametrize('verb', [('estimate', '--out'), ('evaluate', '--out-bag')])
@@ -223,7 +251,8 @@ def test_nothing_usable_writes_nothing(tmp_path, command, capsys):
     ('--out', 'joints.npz'), INTRINSICS, (*INTRINSICS, '--out', 'joints.csv'), ('--intrinsics', '1', '2', '3'),
     *((*INTRINSICS, '--out', 'joints.npz', name, value) for name, value in (
         ('--max-hands', '0'), ('--min-score', '7'), ('--min-score', '-1'), ('--cube-size', '300'),
-        ('--cube-size', '-0.3'), ('--depth-scale', '-0.001'), ('--depth-scale', '1000'), ('--detector', 'nose')))])
+        ('--cube-size', '-0.3'), ('--depth-scale', '-0.001'), ('--depth-scale', '0'),
+        ('--depth-scale', '1000'), ('--detector', 'nose')))])
 def test_bad_arguments_exit_with_2(folder, command, args):
     with pytest.raises(SystemExit) as leaving:
         command(folder, *args)
@@ -248,7 +277,7 @@ def test_intrinsics_that_cannot_be_are_refused_at_once(folder, tmp_path, command
 def test_where_nothing_can_be_written_is_said(tmp_path, folder, command, capsys):
     (tmp_path / 'file').write_text('')
     assert command(folder, *INTRINSICS, '--overlay', tmp_path / 'file') == 1
-    assert f'{tmp_path / "file"}: File exists' in capsys.readouterr().err
+    assert f'{tmp_path / "file"}: File exists, and a folder is needed: give another name' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize('name', ['missing.mcap', 'missing.png', '.'])

@@ -311,7 +311,8 @@ def test_command_line_shows_writes_and_measures(tmp_path, capsys, shared_data):
             assert image.intrinsics == camera and hand.sides == (side,)
             np.testing.assert_allclose(image.depth, depth, atol=0.00051)
             np.testing.assert_allclose(hand.joints[0], joints, atol=1e-6)
-    assert main(['synth', 'write', str(tmp_path / 'data'), '--number', '5', '--shard', '3', '--split', 'val']) == 0
+    assert main(['synth', 'write', str(tmp_path / 'data'), '--number', '5', '--shard', '3', '--split', 'val', '--start',
+                 '0']) == 0
     shards = sorted((tmp_path / 'data').iterdir())
     assert [shard.name for shard in shards] == ['val_000000000.npz', 'val_000000003.npz']
     with np.load(shards[1]) as shard:

@@ -78,7 +78,14 @@ def test_an_image_without_an_answer_is_counted(monkeypatch: pytest.MonkeyPatch, 
     assert (summary['frames_in'], summary['frames_answered'], summary['frames_with_a_hand']) == (2, 1, 0)
     assert summary['latency_p50_ms'] == pytest.approx(12) and summary['joint_error_mean_mm'] is None
     write_bag(tmp_path / 'truth.mcap')
-    assert len(_truth(tmp_path / 'truth.mcap', HAND21)) == COUNT
+    truth = _truth(tmp_path / 'truth.mcap', HAND21)
+    assert len(truth) == COUNT
+    stamp, real = next(iter(truth.items()))
+    hand = HandEstimate(real.joints[0] + [0.003, 0, 0.004], HAND21.joint_names, np.ones(21, np.float32), 1.0, 'right',
+                        Cube((0, 0, 0.6), 0.3), 'a')
+    summary = summarise([stamp, 1], answers, {stamp: [hand], 1: []}, truth)
+    assert summary['frames_with_a_hand'] == 1
+    assert [summary[f'joint_error_{kind}_mm'] for kind in ('mean', 'median')] == pytest.approx([5, 5])
     assert not _truth(tmp_path / 'truth.mcap', get_skeleton('msra21'))  # as many joints, but others
 
     write_bag(tmp_path / 'hand.mcap')

@@ -13,7 +13,7 @@ from matplotlib.legend import Legend
 
 from hand_pose_ros.cli import main
 from hand_pose_ros.evaluation import metrics, plots
-from hand_pose_ros.evaluation.published import named_apart
+from hand_pose_ros.evaluation.published import DATASETS, named_apart
 from hand_pose_ros.evaluation.report import write_report
 from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.geometry import Intrinsics
@@ -89,6 +89,7 @@ def test_report_shows_the_best_median_and_worst_frame(result, tmp_path):
     views = json.loads(re.search(r'id="frames">(.*?)</script>', html)[1])['views']
     assert len(views) == 3 and all(len(view['cloud']) > 600 and len(view['estimate']) == 21 for view in views)
     assert all(np.mean(view['truth'], axis=0) == pytest.approx(0, abs=0.1) for view in views), 'the truth in the middle'
+    assert all(max(map(abs, view['cloud'])) <= 150 and len(view['cloud']) < 3 * 5000 for view in views), 'of the hand'
     gap = np.linalg.norm(np.subtract(views[2]['estimate'], views[2]['truth']), axis=1).mean()
     assert gap == pytest.approx(means[order[-1]], abs=0.1), 'the view has the scale of the world'
 
@@ -106,7 +107,8 @@ def test_report_without_truth_shows_times_and_first_middle_last(result, tmp_path
 
 def test_notes_of_all_results_are_told(result, tmp_path):
     one, other = (replace(result, name=name, notes=(f'what to know of {name}',)) for name in ('one', 'other'))
-    html = write_report([one, other], tmp_path).read_text()
+    html = write_report([replace(one, info={'dataset': 'nyu'}), other], tmp_path).read_text()
+    assert all(f'<td>{name}</td><td>{mean:g}</td>' in html for name, mean in DATASETS['nyu'].published)
     assert 'one: what to know of one' in html and 'other: what to know of other' in html
 
 

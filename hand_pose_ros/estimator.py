@@ -177,7 +177,6 @@ class HandPoseEstimator:
     def reset(self) -> None:
         """Forget the hands of the last image."""
         self._tracks.clear()
-        self._last_s = None
 
     def __call__(self, depth: NDArray[np.float32], intrinsics: Intrinsics, *, time_s: float | None = None,
                  regions: Sequence[Region] | None = None) -> list[HandEstimate]:

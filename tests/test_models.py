@@ -330,6 +330,15 @@ def test_dense_maps_and_joints_are_inverse_to_each_other():
     again, agreement = decode(positions, seen, directions, closeness)
     torch.testing.assert_close(again, joints, atol=1e-4, rtol=0)
     assert (agreement > 0.8).all()
+    near = closeness > 0
+    assert near.any() and not near.all()
+    torch.testing.assert_close(directions.norm(dim=2), near.float())
+    # What sees nothing has no vote, whatever it says; but where nothing is seen, all have one.
+    blind = seen[:, None] == 0
+    unheard = decode(positions, seen, directions.where(~blind, 1), closeness.where(~blind[:, 0], 1))
+    torch.testing.assert_close(unheard, (again, agreement))
+    nothing = decode(positions, 0 * seen, directions, closeness)
+    torch.testing.assert_close(nothing, decode(positions, 0 * seen + 1, directions, closeness), atol=1e-2, rtol=0)
 
 
 def test_dense_cells_are_in_cube_units():
@@ -363,6 +372,31 @@ def test_a_refinement_starts_as_the_identity_and_learns_from_what_is_seen_at_the
         optimizer.step()
     deeper = (refinement.eval()(*told) - truth).detach()[..., 2].abs().mean()
     assert deeper < 0.5 * (joints - truth)[..., 2].abs().mean()
+
+
+def test_where_a_refinement_reads_is_no_output_and_never_outside():
+    refinement = JointRefinement(2, local=3, whole=4).eval()
+    nn.init.normal_(refinement.output.weight)
+    nn.init.zeros_(refinement.each[:, 3:])  # what is told, and not read
+    joints = torch.tensor([[[0.8, -0.6, 0.1], [1.0, -1.0, 0.0]]], requires_grad=True)
+    local = torch.randn(1, 3, 32, 32, requires_grad=True)
+    rest = torch.zeros(1, 2, 3), torch.zeros(1, 2), local, torch.randn(1, 4)
+    moved = refinement(joints, *rest) - joints
+    moved.sum().backward()
+    assert moved.abs().max() > 0 and joints.grad.abs().max() == 0
+    # Column 28.3 and row 5.9, and the corner at the upper right.
+    rows, columns = local.grad[0].abs().sum(0).nonzero().T.tolist()
+    assert list(zip(rows, columns, strict=True)) == [(0, 31), (5, 28), (5, 29), (6, 28), (6, 29)]
+    further = joints.detach() * torch.tensor([[[1.0], [3.0]]])
+    torch.testing.assert_close(refinement(further, *rest) - further, moved)
+
+
+def test_joints_do_not_bend_the_confidence():
+    network = build('hand_dense', width=8, bottleneck=8, refined=True)
+    for layer in (network.head.output, network.refinement.output):
+        nn.init.normal_(layer.weight)
+    network(hand_patches(2)).sum().backward()
+    assert network.summary.weight.grad is None and network.head.hidden.weight.grad.abs().sum() > 0
 
 
 def test_dense_network_says_everything_and_survives_an_empty_patch():

@@ -79,8 +79,32 @@ def test_range_and_regions_limit_where_hands_are_looked_for(nearest) -> None:
     assert round(nearest(depth, CAMERA)[0].center[2], 3) == 0.5
     assert {round(cube.center[2], 3) for cube in nearest(depth, CAMERA, near=0.6)} == {0.8}
     assert {round(cube.center[2], 3) for cube in nearest(depth, CAMERA, far=0.6)} == {0.5}
-    assert {round(cube.center[2], 3) for cube in nearest(depth, CAMERA, regions=[(480, 280, 100, 100)])} == {0.8}
+    for region, z in (((480, 0, 160, 480), 0.8), ((0, 280, 640, 200), 0.8), ((0, 0, 400, 480), 0.5),
+                      ((0, 0, 640, 200), 0.5), ((100, 100, 40, 40), 0.5)):
+        assert {round(cube.center[2], 3) for cube in nearest(depth, CAMERA, regions=[region])} == {z}
     assert nearest(depth, CAMERA, regions=[]) == []
+    depth[112:128, 112:128] = 0.7  # between what is too near
+    assert {round(cube.center[2], 3) for cube in nearest(depth, CAMERA, near=0.6)} == {0.7, 0.8}
+
+
+def test_the_six_likeliest_places_are_told_each_where_it_is_the_likeliest(nearest) -> None:
+    depth = np.zeros((480, 640), np.float32)
+    for k in range(8):
+        rows, columns = np.mgrid[:80, :80]
+        depth[160 * (k // 4):, 160 * (k % 4):][:80, :80] = 0.5 + 0.1 * k + 0.0002 * (rows + columns)
+    cubes = nearest(depth, CAMERA, side=0.25)
+    assert [round(cube.center[2], 1) for cube in cubes] == [0.5, 0.6, 0.7, 0.8, 0.9, 1.0]
+    assert {cube.side for cube in cubes} == {0.25}
+    assert nearest(np.full((480, 640), 7.1, np.float32), CAMERA, far=9.0)
+    assert nearest(np.full((480, 640), 7.3, np.float32), CAMERA, far=9.0) == []  # which scores 0.09
+
+
+def test_the_middle_of_a_cell_is_where_the_camera_sees_it(nearest) -> None:
+    camera = Intrinsics(2 * FOCAL, 4 * FOCAL, 90.0, 130.0, 192, 256)  # pixels a half and a quarter as large
+    depth = np.zeros((256, 192), np.float32)
+    depth[64:80, 40:48] = 0.5
+    [cube] = nearest(depth, camera)
+    assert camera.project(np.array(cube.center)) == pytest.approx((43.5, 71.5), abs=1e-3)
 
 
 def test_weights_of_another_network_are_refused() -> None:

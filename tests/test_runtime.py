@@ -108,9 +108,10 @@ def test_the_cpu_engine_refines_as_plain_pytorch_does(architecture, refiner):
 
 @pytest.mark.parametrize(('channels', 'kernel', 'pool', 'size'), [
     (8, 5, 4, 128), (8, 5, 2, 31), (3, 3, 2, 16), (8, 4, 2, 9)])
-def test_two_pixels_at_a_time_give_the_same(channels, kernel, pool, size):
+@pytest.mark.parametrize('bias', [True, False])
+def test_two_pixels_at_a_time_give_the_same(channels, kernel, pool, size, bias):
     torch.manual_seed(0)
-    block = nn.Sequential(nn.Conv2d(2, channels, kernel), nn.MaxPool2d(pool), nn.ReLU())
+    block = nn.Sequential(nn.Conv2d(2, channels, kernel, bias=bias), nn.MaxPool2d(pool), nn.ReLU())
     patches = torch.randn(3, 2, size, size)
     expected = block(patches)
     fill_lanes(block)
@@ -122,7 +123,12 @@ def test_two_pixels_at_a_time_give_the_same(channels, kernel, pool, size):
     [nn.Conv2d(1, 12, 3), nn.MaxPool2d(2), nn.ReLU()], [nn.Conv2d(1, 8, 3), nn.MaxPool2d(3), nn.ReLU()],
     [nn.Conv2d(1, 8, 3), nn.ReLU()], [nn.Conv2d(1, 8, 3), nn.MaxPool2d(2)],
     [nn.Conv2d(1, 8, 3, padding=1), nn.MaxPool2d(2), nn.ReLU()],
-    [nn.Conv2d(2, 8, 3, groups=2), nn.MaxPool2d(2), nn.ReLU()]])
+    [nn.Conv2d(2, 8, 3, groups=2), nn.MaxPool2d(2), nn.ReLU()],
+    [nn.Conv2d(1, 8, 3, stride=2), nn.MaxPool2d(2), nn.ReLU()],
+    [nn.Conv2d(1, 8, 3, dilation=2), nn.MaxPool2d(2), nn.ReLU()],
+    [nn.Conv2d(1, 8, 3), nn.MaxPool2d(2, stride=1), nn.ReLU()],
+    [nn.Conv2d(1, 8, 3), nn.MaxPool2d(2, padding=1), nn.ReLU()],
+    [nn.Conv2d(1, 8, 3), nn.MaxPool2d(2, ceil_mode=True), nn.ReLU()]])
 def test_what_would_not_gain_or_not_be_equal_stays(block):
     network = nn.Sequential(*block)
     fill_lanes(network)

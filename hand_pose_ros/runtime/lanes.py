@@ -21,7 +21,8 @@ class PairedConvolution(nn.Module):
         super().__init__()
         channels, _, height, width = convolution.weight.shape
         self.channels = channels
-        self.pair = nn.Conv2d(convolution.in_channels, 2 * channels, (height, width + 1), stride=(1, 2))
+        self.pair = nn.Conv2d(convolution.in_channels, 2 * channels, (height, width + 1), stride=(1, 2),
+                              bias=convolution.bias is not None)
         self.pool = nn.MaxPool2d((pool, pool // 2))
         with torch.no_grad():
             self.pair.weight.zero_()

@@ -102,7 +102,7 @@ def test_the_six_likeliest_places_are_told_each_where_it_is_the_likeliest(neares
 def test_the_middle_of_a_cell_is_where_the_camera_sees_it(nearest) -> None:
     camera = Intrinsics(2 * FOCAL, 4 * FOCAL, 90.0, 130.0, 192, 256)  # pixels a half and a quarter as large
     depth = np.zeros((256, 192), np.float32)
-    depth[64:80, 40:48] = 0.5
+    depth[66:80:4, 41:48:2] = 0.5  # those that are seen
     [cube] = nearest(depth, camera)
     assert camera.project(np.array(cube.center)) == pytest.approx((43.5, 71.5), abs=1e-3)
 

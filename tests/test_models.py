@@ -391,6 +391,15 @@ def test_where_a_refinement_reads_is_no_output_and_never_outside():
     torch.testing.assert_close(refinement(further, *rest) - further, moved)
 
 
+def test_training_in_half_precision_halves_neither_votes_nor_joints():
+    network = build('hand_dense', width=8, bottleneck=8).eval()
+    with torch.autocast('cpu', torch.bfloat16):
+        answer = network.forward_full(hand_patches(2))
+    votes, _ = decode(*(answer[name] for name in ('positions', 'seen', 'directions', 'closeness')))
+    torch.testing.assert_close(answer['votes'], votes, atol=1e-6, rtol=0)
+    torch.testing.assert_close(answer['joints'], network.head(votes, answer['confidence']), atol=1e-6, rtol=0)
+
+
 def test_joints_do_not_bend_the_confidence():
     network = build('hand_dense', width=8, bottleneck=8, refined=True)
     for layer in (network.head.output, network.refinement.output):

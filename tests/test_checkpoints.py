@@ -9,6 +9,7 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
+from hand_pose_ros import __version__
 from hand_pose_ros.errors import CheckpointError
 from hand_pose_ros.models import build, checkpoints
 from hand_pose_ros.models.checkpoints import available, load_checkpoint, save_checkpoint
@@ -100,8 +101,18 @@ def test_names_and_paths(file, monkeypatch):
     assert load_checkpoint(str(file)).metadata['note'] == 'made by a test'
     with pytest.raises(CheckpointError, match="no checkpoint named 'large': the ones that ship are small"):
         load_checkpoint('large')
-    with pytest.raises(CheckpointError, match=r'no checkpoint file .*nowhere\.safetensors'):
-        load_checkpoint(file.parent / 'nowhere.safetensors')
+    monkeypatch.setenv('HOME', str(file.parent))
+    assert load_checkpoint('~/small.safetensors').metadata['note'] == 'made by a test'
+    for missing in (file.parent / 'nowhere.safetensors', 'nowhere.safetensors', 'nowhere/small'):
+        with pytest.raises(CheckpointError, match=f'no checkpoint file .*{missing}'):
+            load_checkpoint(missing)
+
+
+def test_what_a_checkpoint_is_comes_from_its_network_whatever_it_grew_from(file, tmp_path):
+    grown = tmp_path / 'grown.safetensors'
+    save_checkpoint(grown, build('shallow'), {**load_checkpoint(file).metadata, 'version': '0'})
+    metadata = load_checkpoint(grown).metadata
+    assert metadata['architecture'] == 'shallow' and metadata['version'] == __version__
 
 
 def test_every_checkpoint_that_ships_loads():

@@ -58,6 +58,7 @@ def save_checkpoint(path: str | Path, network: nn.Module, metadata: dict[str, An
     if missing := {'skeleton', 'cube_side'} - metadata.keys():
         raise CheckpointError(f"the metadata of checkpoint {path} lacks {', '.join(sorted(missing))}")
     metadata = {**metadata, **_description(network), 'version': __version__}
+    metadata.pop('refiner', None)  # of the checkpoint that these metadata were taken from
     tensors = _tensors('network', network, half)
     if refiner is not None:
         metadata['refiner'] = _description(refiner)

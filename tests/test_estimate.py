@@ -339,6 +339,21 @@ def test_joints_are_drawn_where_they_are_in_the_colour_of_their_finger(drawn):
         assert color_at(close_up(depth, camera, hand.cube, hand.joints), hand.joints[tip], cube) == color
 
 
+def test_a_picture_shows_the_surface_where_it_is_the_cube_and_what_was_found(drawn):
+    depth, camera, hand = drawn
+    thrice = overlay(depth, camera, [], height=720)
+    np.testing.assert_allclose(thrice[1::3, 1::3][20:].astype(int), shade(depth, camera)[20:], atol=1)
+    picture = overlay(depth, camera, [hand])
+    for part, change in ((slice(640), {'cube': Cube((0.0, 0.0, 0.5), 0.2)}), (slice(640, 1120), {'side': 'right'}),
+                         (slice(640, 1120), {'score': 0.6})):
+        other = overlay(depth, camera, [SimpleNamespace(**{**vars(hand), **change})])
+        assert (other[:, part] != picture[:, part]).any()
+    aside = depth.copy()
+    aside[:, :40] = 0.2  # outside the cube it does not change how the cube is tinted
+    np.testing.assert_array_equal(close_up(aside, camera, hand.cube, hand.joints),
+                                  close_up(depth, camera, hand.cube, hand.joints))
+
+
 def test_nothing_is_dark_and_near_is_brighter_than_far():
     camera = Intrinsics(400.0, 400.0, 160.0, 120.0, 320, 240)
     depth = np.full((240, 320), 1.0, np.float32)
@@ -346,6 +361,11 @@ def test_nothing_is_dark_and_near_is_brighter_than_far():
     picture = shade(depth, camera).astype(int).sum(axis=2)
     assert picture[120, 50] > picture[120, 160] > picture[120, 270]
     assert shade(np.zeros((4, 4), np.float32), camera).max() < 40
+    # The light is over the left shoulder: of ridges, the left and the upper flanks are brighter.
+    v, u = np.mgrid[:240, :320]
+    for at, first, second in ((np.abs(u - 160), (120, 100), (120, 220)), (np.abs(v - 120), (60, 160), (180, 160))):
+        ridge = shade((0.5 + at / 800).astype(np.float32), camera).astype(int).sum(axis=2)
+        assert ridge[first] > ridge[second] + 100
 
 
 def test_what_is_not_finite_is_drawn_as_no_reading(drawn):
@@ -358,14 +378,29 @@ def test_what_is_not_finite_is_drawn_as_no_reading(drawn):
     np.testing.assert_array_equal(shade(depth.astype(float), camera), shade(depth, camera))
 
 
+def test_the_nearest_joint_is_on_top(drawn):
+    depth, camera, hand = drawn
+    for z in (0.45, 0.55):
+        joints = np.full((21, 3), np.nan)
+        joints[list(HAND21.tips[:2])] = np.array([0.1, 0.1, 1]) * [[0.5], [z]]
+        picture = close_up(depth, camera, hand.cube, joints)
+        cube = Intrinsics(800.0, 800.0, 239.5, 239.5, 480, 480)
+        assert color_at(picture, joints[4], cube) == FINGER_COLORS['index' if z < 0.5 else 'thumb']
+
+
 def test_joints_that_are_nowhere_are_not_drawn(drawn):
     depth, camera, hand = drawn
     whole, nothing = (close_up(depth, camera, hand.cube, joints) for joints in (hand.joints, np.full((21, 3), np.nan)))
+    aside = hand.joints.copy()
+    aside[HAND21.tips[1], 0] = 1e8
+    assert (close_up(depth, camera, hand.cube, aside) != whole).any()  # whose pixel no integer holds
     for nowhere in (np.nan, np.inf, 0.0):
-        joints = hand.joints.copy()
-        joints[HAND21.tips[1]] = nowhere
-        picture = close_up(depth, camera, hand.cube, joints)
-        assert (picture != whole).any() and (picture != nothing).any()
+        for joint in (HAND21.tips[1], HAND21.tips[1] - 1):  # nor are bones from or to them
+            joints = hand.joints.copy()
+            joints[joint] = nowhere
+            picture = close_up(depth, camera, hand.cube, joints)
+            assert (picture != whole).any() and (picture != nothing).any()
+            assert (picture[(whole == nothing).all(axis=2)] == nothing[(whole == nothing).all(axis=2)]).all()
         np.testing.assert_array_equal(close_up(depth, camera, hand.cube, np.full((21, 3), nowhere)), nothing)
 
 
@@ -381,6 +416,7 @@ def test_a_contact_sheet_is_read_like_text():
     sheet = contact_sheet([np.full((2, 3, 3), value, np.uint8) for value in (50, 100, 150)], columns=2)
     assert sheet.shape == (4, 6, 3)
     assert (sheet[0, 0, 0], sheet[0, 3, 0], sheet[2, 0, 0]) == (50, 100, 150)
+    assert contact_sheet([np.zeros((2, 3, 3), np.uint8)]).shape == (2, 3, 3)
 
 
 def test_nothing_is_added_to_the_folder_of_an_interrupted_recording(bag, tmp_path, command, capsys):

@@ -79,6 +79,10 @@ def test_markers_are_joints_and_bones_in_the_colours_of_the_fingers() -> None:
     np.testing.assert_allclose((color.r, color.g, color.b), np.array(FINGER_COLORS['pinky']) / 255, atol=1e-6)
     ends = np.array([(p.x, p.y, p.z) for p in bones.points]).reshape(-1, 2, 3)
     np.testing.assert_allclose(ends, estimate.joints[np.array(HAND21.bones)], atol=1e-6)
+    for (_, child), color in zip(HAND21.bones, bones.colors[::2], strict=True):  # of the finger that it leads to
+        expected = np.array(FINGER_COLORS[HAND21.fingers[child]]) / 255
+        np.testing.assert_allclose((color.r, color.g, color.b), expected, atol=1e-6)
+    assert bones.colors[::2] == bones.colors[1::2]
     edges = np.array([(p.x, p.y, p.z) for p in cube.points]).reshape(-1, 2, 3)
     assert len(edges) == 12
     np.testing.assert_allclose(np.linalg.norm(edges[:, 0] - edges[:, 1], axis=1), 0.3, atol=1e-6)

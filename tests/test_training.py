@@ -185,6 +185,42 @@ def test_a_moved_and_scaled_patch_is_the_crop_of_the_moved_and_scaled_cube():
             border = int(64 * (1 - 0.3 / cube.side)) + 8
             known[:border] = known[-border:] = known[:, :border] = known[:, -border:] = False
         assert ((after['patch'][i, 0] - patch).abs() < 0.1)[known].float().mean() > 0.97
+        assert ((after['patch'][i, 0] == 1) == (patch == 1))[known].float().mean() > 0.97
+
+
+def test_turns_are_to_both_sides_by_degrees():
+    batch = {key: value[:1].expand(2000, *value.shape[1:]) for key, value in sample().items() if key != 'patch'}
+    x, y, _ = augment(batch, Augmentation(rotation_deg=30), torch.arange(2000), seed=1)['cube_center'].T
+    turned = torch.rad2deg(torch.atan2(y, x) - np.arctan2(-0.04, 0.06))
+    assert turned.min().item() == pytest.approx(-30, abs=0.2) and turned.max().item() == pytest.approx(30, abs=0.2)
+
+
+def test_readings_are_disturbed_and_lost_as_much_as_is_said():
+    batch = {key: value[:1].expand(400, *value.shape[1:]) for key, value in sample().items()}
+    batch['patch'] = torch.zeros(400, 1, 64, 64)
+    noisy = augment(batch, Augmentation(noise=0.01, dropout=0.3), torch.arange(400), seed=1)['patch']
+    metres = 0.15 * noisy[noisy < 1]
+    assert metres.std() == pytest.approx(0.01 / 3 ** 0.5, rel=0.1)  # of deviations from 0 to 0.01
+    assert abs(metres.mean()) < 1e-4  # what is lost has been no nearer than the rest
+    assert (noisy == 1).float().mean() == pytest.approx(0.15, rel=0.1)
+    erased = (augment(batch, Augmentation(erase=0.5), torch.arange(400), seed=1)['patch'] == 1).float().mean((1, 2, 3))
+    assert (erased > 0).float().mean() == pytest.approx(0.5, abs=0.1)
+    assert 0.015 < erased[erased > 0].min() < 0.03 and 0.17 < erased.max() < 0.21
+
+
+def test_a_mirrored_patch_is_the_patch_in_the_mirror():
+    before = sample()
+    after = augment(before, Augmentation(mirror=1.0), torch.arange(4), seed=1)
+    torch.testing.assert_close(after['patch'], before['patch'].flip(-1), atol=1e-6, rtol=0)
+    torch.testing.assert_close(after['joints'], before['joints'] * torch.tensor([-1.0, 1.0, 1.0]))
+
+
+def test_a_shift_is_in_metres_and_three_times_as_far_in_the_tail():
+    batch = {key: value[:1].expand(2000, *value.shape[1:]) for key, value in sample().items() if key != 'patch'}
+    near, far = (augment(batch, Augmentation(jitter=0.01, jitter_tail=tail), torch.arange(2000), seed=1)['cube_center']
+                 - batch['cube_center'] for tail in (0.0, 1.0))
+    assert near[:, 2].std() == pytest.approx(0.01, rel=0.1)
+    torch.testing.assert_close(far, 3 * near, atol=1e-6, rtol=0)
 
 
 def test_augmentation_depends_on_the_sample_and_not_on_its_neighbours():
@@ -195,6 +231,8 @@ def test_augmentation_depends_on_the_sample_and_not_on_its_neighbours():
         torch.testing.assert_close(value[0], together[key][2], atol=1e-6, rtol=0)
     other = augment(batch, PRESETS['modern'], numbers, seed=6)
     assert not torch.equal(other['joints'], together['joints'])
+    later = augment(batch, PRESETS['modern'], numbers + (1 << 20), seed=5)
+    assert not torch.equal(other['joints'], later['joints'])
 
 
 def test_degraded_patches_stay_in_range_and_keep_the_background():
@@ -242,6 +280,9 @@ def test_huber_is_of_the_distance_and_samples_that_do_not_count_add_nothing():
     assert one.item() == pytest.approx(both.item() / 2)
     one.backward()
     assert joints.grad[0].abs().min(0).values.max() > 0 and joints.grad[1].abs().max() == 0
+    for apart, loss in ((1.0, (0.25 + 0.35) / 3), (0.1, (0.03 ** 2 + 0.04 ** 2) / 0.2 / 3)):  # beyond the knee, within
+        some = joint_loss('smooth_l1', 0.1, apart * moved, truth, torch.tensor([True, False]))
+        assert some.item() == pytest.approx(loss / 2)
     exact = torch.zeros(1, 21, 3, requires_grad=True)
     joint_loss('huber', 0.1, exact, truth[:1], torch.tensor([True])).backward()
     assert exact.grad.isfinite().all()
@@ -257,6 +298,52 @@ def test_schedules():
     rates = [learning_rate(modern, progress) for progress in (0, modern.warmup, 0.5, 1)]
     assert rates[0] == 0 and rates[1] > 0.99 * modern.learning_rate and rates[3] < 1e-9
     assert rates[2] == pytest.approx(modern.learning_rate / 2)
+
+
+def steps(optimizer: str, *gradients: torch.Tensor, **values: float) -> torch.Tensor:
+    """How far each of these gradients moves a weight, at a learning rate of 1."""
+    network = nn.ParameterList([torch.zeros_like(gradients[0])])
+    recipe = replace(get_recipe('paper'), optimizer=optimizer, learning_rate=1.0, weight_decay=0.0, **values)
+    stepper, places = make_optimizer(recipe, network), [network[0].detach().clone()]
+    for gradient in gradients:
+        network[0].grad = gradient.clone()
+        stepper.step()
+        places.append(network[0].detach().clone())
+    return torch.stack(places).diff(dim=0)
+
+
+def test_rmsprop_is_that_of_the_original_code():
+    gradient = torch.tensor([[1.0, 0.001]])  # the second of which is below the floor
+    torch.testing.assert_close(steps('rmsprop', gradient, gradient, momentum=0.0), -torch.tensor([
+        [[0.1 ** -0.5, 0.1]], [[0.19 ** -0.5, 0.1]]]))
+
+
+def test_momentum_goes_on():
+    gradient = torch.ones(1, 2)
+    moved = steps('sgd', gradient, gradient, momentum=0.5)
+    torch.testing.assert_close(moved, -torch.tensor([[[1.0, 1.0]], [[1.5, 1.5]]]))
+    gradient = torch.randn(4, 9, 1, 1, generator=torch.Generator().manual_seed(0))
+    # Nesterov's looks ahead: it turns before the momentum does.
+    for last, sign in ((0.0, 1), (-0.45, 1), (-0.48, -1)):
+        first, second = steps('muon', gradient, last * gradient)
+        torch.testing.assert_close(second, sign * first, atol=0.02, rtol=0)
+        assert first.square().mean().sqrt() == pytest.approx(0.8, rel=0.2)
+
+
+@pytest.mark.parametrize('optimizer', ['sgd', 'adamw', 'muon'])
+def test_weights_are_decayed_and_biases_and_norms_are_not(optimizer):
+    network = build('hand_dense', width=4, refined=True)
+    for parameter in network.parameters():
+        nn.init.ones_(parameter)
+        parameter.grad = torch.zeros_like(parameter)
+    recipe = replace(get_recipe('paper'), optimizer=optimizer, learning_rate=0.1, weight_decay=0.5)
+    make_optimizer(recipe, network).step()
+    kept = {name for name, parameter in network.named_parameters() if (parameter == 1).all()}
+    norms = {f'{name}.weight' for name, part in network.named_modules()
+             if isinstance(part, nn.BatchNorm1d | nn.BatchNorm2d)}
+    assert kept == norms | {name for name, _ in network.named_parameters() if name.endswith('bias')}
+    assert all(parameter.mean().item() == pytest.approx(0.95) for name, parameter in network.named_parameters()
+               if name not in kept)
 
 
 def test_rmsprop_refuses_what_it_would_ignore():
@@ -412,6 +499,26 @@ def test_a_stopped_run_continues_bit_for_bit(folder, tmp_path, recipe):
     assert same_state(tmp_path / 'whole', tmp_path / 'stopped')
     assert [json.loads(line)['step'] for line in metrics.read_text().splitlines()] == [3, 10, 10]
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_what_is_validated_and_shipped_is_the_average_of_the_weights_and_of_what_norms_have_seen(folder, tmp_path):
+    run = tiny(folder, *MODERN, 'samples=12', 'learning_rate=0.1', 'warmup=0', 'average=0.15', recipe='modern',
+               out=tmp_path)
+    expected, train_step = copy.deepcopy(run.objective.network.state_dict()), run._train_step
+
+    def watched(gradients):
+        terms, decay = train_step(gradients), (0.1, 0.15, 0.15)[run.step - 1]  # the random start is forgotten soon
+        for name, value in run.objective.network.state_dict().items():
+            last = expected[name]
+            expected[name] = decay * last + (1 - decay) * value if value.is_floating_point() else value.clone()
+        return terms
+    run._train_step = watched
+    run.train()
+    shipped = load_checkpoint(tmp_path / 'last.safetensors').network.state_dict()
+    last = run.objective.network.state_dict()
+    for name, value in expected.items():
+        torch.testing.assert_close(shipped[name], value, atol=1e-3, rtol=1e-3)
+    assert (last['maps.weight'] - expected['maps.weight']).abs().max() > 0.005
 
 
 @pytest.mark.parametrize(('whole', 'damaged'), [

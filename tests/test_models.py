@@ -86,6 +86,16 @@ def test_initialisation_follows_the_original():
     assert all((p == 0).all() for name, p in network.named_parameters() if name.endswith('bias'))
 
 
+@pytest.mark.parametrize('architecture', ['shallow', 'deep', 'multi_scale'])
+def test_hidden_units_are_dropped_while_a_network_learns_as_often_as_is_said(architecture):
+    network, patches = build(architecture, dropout=0.0), hand_patches(1)
+    assert torch.equal(network(patches), network(patches))
+    network = build(architecture, dropout=0.6)
+    dropped = [part for part in network.modules() if isinstance(part, nn.Dropout)]
+    assert dropped and all(part.p == 0.6 for part in dropped)
+    assert not torch.equal(network(patches), network(patches))
+
+
 @pytest.mark.parametrize('architecture', POSE_NETWORKS)
 @pytest.mark.parametrize('joints', [14, 21])
 def test_every_pose_network_maps_patches_to_joints_and_learns(architecture, joints):
@@ -167,6 +177,10 @@ def test_the_prior_equals_a_singular_value_decomposition():
     np.testing.assert_allclose(prior.components @ prior.components.T, np.eye(8), atol=1e-12)
     expected = (poses - poses.mean(0)) @ rows[:8].T @ rows[:8] + poses.mean(0)
     np.testing.assert_allclose(prior.reconstruct(prior.project(poses)), expected, atol=1e-9)
+    still = fit_prior(np.ones((40, 63)))  # of a hand that never moves
+    assert (still.explained_variance_ratio == 0).all() and np.isfinite(still.components).all()
+    assert (fit_prior(poses, 63).explained_variance_ratio >= 0).all()
+    assert (np.abs(prior.components).max(1) == prior.components.max(1)).all()  # and that one is chosen
     # Twelve degrees of freedom need twelve components and no more.
     full = fit_prior(poses, 12)
     np.testing.assert_allclose(full.reconstruct(full.project(poses)), poses, atol=1e-9)
@@ -193,6 +207,8 @@ def test_mistakes_are_named():
         build('deep_prior').set_prior(np.zeros(42), np.zeros((30, 42)))
     with pytest.raises(HandPoseError, match=r'30 components need .* options\.bottleneck=N'):
         fit_prior(np.zeros((10, 63)), 30)
+    with pytest.raises(HandPoseError, match='30 components need'):
+        fit_prior(np.zeros((100, 12)), 30)
     with pytest.raises(HandPoseError, match='not finite'):
         fit_prior(np.full((100, 63), np.nan), 30)
 

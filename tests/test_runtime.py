@@ -184,10 +184,11 @@ def test_an_answer_is_kept_when_the_next_image_comes():
 
 
 def test_the_network_given_stays_as_it_is():
-    network = build('deep_prior')
-    make_engine(network, 'cpu')
-    assert network.training
-    assert all(p.requires_grad for p in network.parameters())
+    network, refiner = build('deep_prior'), build('or_ref')
+    make_engine(network, 'cpu', refiner=refiner)
+    for module in (network, refiner):
+        assert module.training
+        assert all(p.requires_grad for p in module.parameters())
 
 
 @pytest.mark.parametrize('patches', [
@@ -209,6 +210,9 @@ def test_a_device_that_is_not_there_is_named():
     network = build('shallow')
     with pytest.raises(HandPoseError, match="device 'quantum' cannot be used here"):
         make_engine(network, 'quantum')
+    for part in ('center_refiner', 'or_ref'):
+        with pytest.raises(HandPoseError, match=f'weights of {part} give no joints'):
+            make_engine(build(part), 'cpu')
     with pytest.raises(HandPoseError, match='num_threads is 0'):
         make_engine(network, 'cpu', num_threads=0)
     if not torch.cuda.is_available():
@@ -260,6 +264,8 @@ def test_many_hands_run_by_turns_in_graphs_that_none_overwrites_too_soon(count, 
     assert joints.shape == (count, 21, 3)
     np.testing.assert_array_equal(joints[:, 0, 0], np.arange(count))
     assert len(engine._captured) <= 3
+    sizes = {0: {1}, 1: {1}, LARGEST: {LARGEST}}.get(count, {LARGEST, 8})  # powers of two, the next larger ones
+    assert {size for size, _ in engine._captured} == sizes
 
 
 @pytest.mark.parametrize('name', ['deep_prior', 'hand_dense'])

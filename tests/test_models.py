@@ -205,6 +205,8 @@ def test_mistakes_are_named():
         build('deep').set_prior(np.zeros(63), np.zeros((30, 63)))
     with pytest.raises(HandPoseError, match='does not fit a bottleneck of 30 and 21 joints'):
         build('deep_prior').set_prior(np.zeros(42), np.zeros((30, 42)))
+    with pytest.raises(HandPoseError, match=r'mean \(42,\) does not fit'):
+        build('deep_prior').set_prior(np.zeros(42), np.zeros((30, 63)))
     with pytest.raises(HandPoseError, match=r'30 components need .* options\.bottleneck=N'):
         fit_prior(np.zeros((10, 63)), 30)
     with pytest.raises(HandPoseError, match='30 components need'):
@@ -225,16 +227,31 @@ def test_the_center_refiner_sees_fine_the_middle_and_coarsely_the_rest():
     patches = hand_patches(3)
     palm = network(patches)
     assert palm.shape == (3, 3)
-    corner = patches.clone()
-    corner[..., :8, :8] = -1
-    middle = patches.clone()
-    middle[..., 60:68, 60:68] = -1
+    middle = slice(60, 68)
+    windows = [(slice(0, 8), slice(0, 8), 1), (middle, middle, 3)]
+    for first, behind, coarser in ((32, 96, 1), (48, 80, 2)):  # at the borders of the crops, inside and outside
+        for inside, outside in ((slice(first, first + 4), slice(first - 4, first)),
+                                (slice(behind - 4, behind), slice(behind, behind + 4))):
+            windows += [(inside, middle, coarser + 1), (middle, inside, coarser + 1), (outside, middle, coarser),
+                        (middle, outside, coarser)]
     with torch.no_grad():
         branches = network.features.branches
-        for changed, seen in ((corner, [True, False, False]), (middle, [True, True, True])):
+        for rows, columns, seeing in windows:
+            changed = patches.clone()
+            changed[..., rows, columns] = -1
+            seen = [number < seeing for number in range(3)]
             for branch, before, after, sees in zip(branches, network.features.views(patches),
                                                    network.features.views(changed), seen, strict=True):
                 assert (branch(before) != branch(after)).any().item() is sees
+
+
+def test_multi_scale_sees_the_patch_at_full_half_and_quarter_resolution():
+    patches = hand_patches(2)
+    whole, half, quarter = build('multi_scale').features.views(patches)
+    assert torch.equal(whole, patches)
+    for view, size in ((half, 2), (quarter, 4)):
+        cells = patches.unflatten(3, (-1, size)).unflatten(2, (-1, size))
+        torch.testing.assert_close(view, cells.mean((3, 5)))
 
 
 def awake(architecture: str) -> Refiner:

@@ -20,6 +20,7 @@ rclpy = pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
 
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from lifecycle_msgs.msg import Transition  # noqa: E402
 from lifecycle_msgs.srv import ChangeState, GetState  # noqa: E402
 from rcl_interfaces.msg import Log  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
@@ -336,6 +337,15 @@ def test_lifecycle(rig: Rig) -> None:
     assert rig.transition('configure') and rig.transition('activate')
     assert rig.answer(rig.camera(info=camera_info()), image(depth_with_hand())).hands
     assert rig.transition('shutdown') and rig.state() == 'finalized'
+
+
+def test_a_transition_out_of_place_is_refused(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    node = rig.start()
+    monkeypatch.setattr(node, '_LifecycleNodeMixin__change_state',  # up to Jazzy rclpy raises what this does
+                        lambda number: node._state_machine.trigger_transition_by_id(number, True))
+    assert not rig.call(ChangeState, 'change_state', transition=Transition(id=Transition.TRANSITION_ACTIVATE)).success
+    rig.until_said('there is no transition 3 from the state active', 'ros2 lifecycle list /estimator')
+    assert rig.answer(rig.camera(info=camera_info()), image(depth_with_hand())).hands
 
 
 def test_unknown_weights_are_named_and_can_be_corrected(rig: Rig) -> None:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from lifecycle_msgs.srv import ChangeState
 from numpy.typing import NDArray
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
@@ -83,6 +84,8 @@ class EstimatorNode(LifecycleNode):
         self._info_stamp = -1  # of the newest camera_info, ns
         self._reset = False  # asked for; the worker, who alone touches the estimator, does it
         super().__init__('estimator', **kwargs)
+        self._change_state = self._service_change_state.callback
+        self._service_change_state.callback = self._on_change_state
         self._params = parameters.declare(self)
         for name in parameters.unknown(self):
             if not name.startswith(QOS):
@@ -214,6 +217,16 @@ class EstimatorNode(LifecycleNode):
         except HandPoseError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
+
+    def _on_change_state(self, request: ChangeState.Request, response: ChangeState.Response) -> ChangeState.Response:
+        try:
+            return self._change_state(request, response)
+        except RuntimeError:  # RCLError, with which rclpy up to Jazzy lets a transition out of place end the node
+            wanted = request.transition.label or request.transition.id
+            self.get_logger().error(f'there is no transition {wanted} from the state {self._state}: ask for one that '
+                                    f'`ros2 lifecycle list {self.get_fully_qualified_name()}` names')
+            response.success = False
+            return response
 
     def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         if self._state not in ('active', 'disabled'):

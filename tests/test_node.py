@@ -714,10 +714,11 @@ def test_a_quality_of_service_that_has_no_effect_is_named(rig: Rig) -> None:
     assert sum('has no effect' in text for text in rig.said()) == 2
 
 
-def test_a_wrong_quality_of_service_is_named(rig: Rig) -> None:
+@pytest.mark.parametrize('policy, value', [('reliability', 'perhaps'), ('depth', 'deep'), ('reliability', True)])
+def test_a_wrong_quality_of_service_is_named(rig: Rig, policy: str, value: object) -> None:
     name = 'qos_overrides./depth/image_rect.subscription'
-    rig.start(**{f'{name}.reliability': 'perhaps'})
-    rig.until_said(name, 'perhaps')
+    rig.start(**{f'{name}.{policy}': value})
+    rig.until_said('cannot listen to', name, str(value))
     assert rig.state() == 'inactive' and rig.client.count_subscribers('/depth/camera_info') == 0
 
 

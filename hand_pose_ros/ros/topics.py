@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.qos import QoSReliabilityPolicy, qos_policy_name_from_kind
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -57,7 +58,7 @@ def subscribe(node: Node, message_type: type, topic: str, callback: Callable[...
             message_type, topic, callback, qos.sensor(),
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=incompatible))
-    except RuntimeError as error:
+    except (RuntimeError, ParameterException) as error:
         raise HandPoseError(f'cannot listen to {topic} ({error}): correct the parameters '
                             f'qos_overrides.{topic}.subscription.*') from error
 

@@ -129,6 +129,25 @@ def test_only_the_ros_room_imports_ros(module: str) -> None:
     assert [name for name in imported_by(module) if ROS.match(name)] == []
 
 
+UBUNTU = {'22.04': {'scipy': '1.8.0', 'matplotlib': '3.5.1', 'opencv-python-headless': '4.5.4', 'tqdm': '4.57.0'},
+          '24.04': {'scipy': '1.11.4', 'matplotlib': '3.6.3', 'opencv-python-headless': '4.6.0', 'tqdm': '4.66.2'}}
+"""What rosdep installs there of the libraries that pyproject.toml names."""
+
+
+@pytest.mark.parametrize('release', UBUNTU)
+@pytest.mark.parametrize('steps', ['README.md', '.github/workflows/ci.yml'])
+def test_pip_brings_what_ubuntu_lacks_or_has_too_old(release: str, steps: str) -> None:
+    requirements = pytest.importorskip('packaging.requirements')
+    needed = re.search(r'\ndependencies = \[(.*?)\]', (CHECKOUT / 'pyproject.toml').read_text(), re.DOTALL)
+    line = re.search(r"pip install ('numpy<2' (?:\\\n|.)*)", (CHECKOUT / steps).read_text())
+    asked = {each.name: each for each in map(requirements.Requirement, re.findall(r'[\w.<>=-]{3,}', line[1]))}
+    for each in map(requirements.Requirement, re.findall(r'"(.*)"', needed[1])):
+        if each.name in UBUNTU[release] and not each.specifier.contains(UBUNTU[release][each.name]):
+            assert asked[each.name].specifier == each.specifier, f'{each}, of which Ubuntu has an older one'
+        elif each.name not in UBUNTU[release]:
+            assert each.name in {*asked, 'filelock'}, f'{each}, which comes with torch only if it is filelock'
+
+
 def test_every_ros_package_that_is_imported_is_a_dependency() -> None:
     named = {tag.text for tag in ElementTree.parse(CHECKOUT / 'package.xml').getroot() if 'depend' in tag.tag}
     modules = [*MODULES, *(str(path.relative_to(CHECKOUT)) for path in (CHECKOUT / 'launch').glob('*.py'))]

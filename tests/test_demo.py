@@ -1,6 +1,9 @@
 """`hand-pose demo`: a bag goes through the live node, and pictures and numbers come out."""
 
 import json
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -103,3 +106,13 @@ def test_an_image_that_cannot_be_decoded_is_left_out_of_the_pictures(monkeypatch
     assert main(['demo', '--bag', str(bag), '--out', str(tmp_path / 'out')]) == 1
     assert json.loads((tmp_path / 'out' / 'summary.json').read_text())['frames_in'] == 3
     assert (tmp_path / 'out' / 'animation.webp').exists()
+
+
+def test_ctrl_c_is_one_sentence(ros_domain: int, tmp_path: Path) -> None:
+    code = 'import sys; from hand_pose_ros.cli import main; sys.exit(main())'
+    with subprocess.Popen([sys.executable, '-c', code, 'demo', '--out', str(tmp_path)], stdout=subprocess.PIPE,
+                          stderr=subprocess.STDOUT, text=True) as process:
+        next(line for line in process.stdout if 'listening to' in line)
+        process.send_signal(signal.SIGINT)
+        assert process.stdout.read().strip() == 'hand-pose demo: interrupted'
+    assert process.returncode == 1

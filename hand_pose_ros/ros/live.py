@@ -20,6 +20,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import CompressedImage, Image
 
 from hand_pose_ros.bags import DepthBag
@@ -84,7 +85,7 @@ def play_through_node(bag: DepthBag, camera_info_topic: str | None = None,
     arguments += [item for name, topic in remappings.items() for item in ('-r', f'{name}:={topic}')]
     if ours := not rclpy.ok():
         qos.let_large_images_through()
-        init()
+        init(signal_handler_options=SignalHandlerOptions.NO)  # with rclpy's, Ctrl-C ends the listener in a traceback
     try:
         with _listening(namespace, bag.depth_topic, Image if transport == 'raw' else CompressedImage) as listener, \
                 _running(arguments) as process:

@@ -349,7 +349,7 @@ def test_a_picture_shows_the_surface_where_it_is_the_cube_and_what_was_found(dra
         other = overlay(depth, camera, [SimpleNamespace(**{**vars(hand), **change})])
         assert (other[:, part] != picture[:, part]).any()
     aside = depth.copy()
-    aside[:, :40] = 0.2  # outside the cube it does not change how the cube is tinted
+    aside[:, :40] = 2.0  # outside the cube it does not change how the cube is tinted
     np.testing.assert_array_equal(close_up(aside, camera, hand.cube, hand.joints),
                                   close_up(depth, camera, hand.cube, hand.joints))
 

@@ -511,6 +511,7 @@ def test_what_is_validated_and_shipped_is_the_average_of_the_weights_and_of_what
         for name, value in run.objective.network.state_dict().items():
             last = expected[name]
             expected[name] = decay * last + (1 - decay) * value if value.is_floating_point() else value.clone()
+            torch.testing.assert_close(run.averaged.network.state_dict()[name], expected[name], atol=1e-6, rtol=1e-6)
         return terms
     run._train_step = watched
     run.train()

@@ -9,6 +9,7 @@ import pytest
 
 from hand_pose_ros import __version__
 from hand_pose_ros.cli import doctor, main
+from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.models import build, checkpoints
 from hand_pose_ros.models.checkpoints import save_checkpoint
 from hand_pose_ros.resources import resource
@@ -53,6 +54,19 @@ def test_a_good_installation(weights: Path, monkeypatch: pytest.MonkeyPatch,
     assert 'onnxruntime on the CPU' in about['device'][0] or 'cuda' in about['device'][0]
     assert 'rmw_' in about['ROS 2'][0] and 'messages built' in about['ROS 2'][0]
     assert '16384 kB' in about['DDS profile'][0]
+
+
+def test_a_gpu_that_this_pytorch_cannot_use(weights: Path, monkeypatch: pytest.MonkeyPatch,
+                                            capsys: pytest.CaptureFixture[str]) -> None:
+    def refuse(device: str) -> None:
+        raise HandPoseError(f'{device} is too old')
+    monkeypatch.setattr('torch.cuda.is_available', lambda: True)
+    monkeypatch.setattr('torch.cuda.device_count', lambda: 1)
+    monkeypatch.setattr('torch.cuda.get_device_name', lambda number: 'GTX 780 Ti')
+    monkeypatch.setattr('hand_pose_ros.runtime.check_device', refuse)
+    _, about = report(capsys)
+    assert about['device'][0].startswith('ok: onnxruntime on the CPU')
+    assert about['device'][1] == 'note: there is GTX 780 Ti, but cuda is too old'
 
 
 def test_missing_and_damaged_weights(weights: Path, monkeypatch: pytest.MonkeyPatch,

@@ -220,6 +220,26 @@ def test_a_device_that_is_not_there_is_named():
             make_engine(network, 'cuda')
 
 
+def unusable_gpu(monkeypatch):
+    """One that PyTorch finds, but has no kernels for."""
+    def zeros(*size, device='cpu', of=torch.zeros, **options):
+        if str(device).startswith('cuda'):
+            raise RuntimeError('CUDA error: no kernel image is available\nand more')
+        return of(*size, device=device, **options)
+
+    monkeypatch.setattr('torch.cuda.is_available', lambda: True)
+    monkeypatch.setattr('torch.zeros', zeros)
+
+
+def test_a_gpu_that_cannot_be_used_is_left_alone_unless_it_is_asked_for(monkeypatch, caplog):
+    network = build('shallow')
+    unusable_gpu(monkeypatch)
+    assert make_engine(network).name == 'onnxruntime'
+    assert "on the CPU: device 'cuda' cannot be used here (CUDA error: no kernel image is available)" in caplog.text
+    with pytest.raises(HandPoseError, match=r"no kernel image is available\): use 'cpu', or a PyTorch for this GPU$"):
+        make_engine(network, 'cuda')
+
+
 @pytest.mark.parametrize(('cores', 'threads'), [(1, 1), (2, 2), (4, 3), (8, 4), (64, 4)])
 def test_threads_leave_room_for_the_rest(cores, threads, monkeypatch):
     monkeypatch.setattr('os.sched_getaffinity', lambda pid: set(range(cores)), raising=False)

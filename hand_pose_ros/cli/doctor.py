@@ -91,13 +91,20 @@ def _device() -> Findings:
     import torch
 
     from hand_pose_ros.models import build
-    from hand_pose_ros.runtime import default_threads, make_engine
+    from hand_pose_ros.runtime import check_device, default_threads, make_engine
+    from hand_pose_ros.runtime.onnx_engine import OnnxEngine
 
-    gpus = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
+    gpus = ', '.join(torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count()))
     engine = make_engine(build('deep_prior'))
     engine.run(np.zeros((1, 1, 128, 128), np.float32))  # builds and runs the real thing
-    yield 'ok', f'{engine.name} on {", ".join(gpus) or f"the CPU, {default_threads()} threads of {os.cpu_count()}"}'
-    if not gpus and shutil.which('nvidia-smi'):
+    on_cpu = isinstance(engine, OnnxEngine)
+    yield 'ok', f'{engine.name} on {f"the CPU, {default_threads()} threads of {os.cpu_count()}" if on_cpu else gpus}'
+    if gpus and on_cpu:
+        try:
+            check_device('cuda')
+        except HandPoseError as error:
+            yield 'note', f'there is {gpus}, but {error}'
+    elif not gpus and shutil.which('nvidia-smi'):
         yield 'note', (f'there is an NVIDIA driver, but PyTorch {torch.__version__} sees no GPU: install a PyTorch '
                        'for CUDA if the network should run there')
 

@@ -43,8 +43,9 @@ def make_engine(network: nn.Module, device: str = 'auto', num_threads: int | Non
     The modules given are left as they are.
 
     Args:
-        device: 'cpu', 'cuda', 'cuda:N', any other device of PyTorch, or 'auto': a CUDA GPU if there is one, else the
-            CPU. ONNX Runtime runs the network on a CPU, CUDA graphs (in half precision) on a GPU, PyTorch elsewhere.
+        device: 'cpu', 'cuda', 'cuda:N', any other device of PyTorch, or 'auto': a CUDA GPU if PyTorch can use one,
+            else the CPU. ONNX Runtime runs the network on a CPU, CUDA graphs (in half precision) on a GPU, PyTorch
+            elsewhere.
         num_threads: on the CPU, at most: see `OnnxEngine`; None takes `default_threads()`.
 
     Raises:
@@ -57,7 +58,7 @@ def make_engine(network: nn.Module, device: str = 'auto', num_threads: int | Non
         raise HandPoseError(f'num_threads is {num_threads}, but a network needs at least one')
     why = f"device '{device}' was asked for"
     if device == 'auto':
-        device, why = ('cuda', 'a GPU was found') if torch.cuda.is_available() else ('cpu', 'no GPU was found')
+        device, why = _chosen()
     pipeline = Pipeline(copy.deepcopy(network), copy.deepcopy(refiner)).requires_grad_(False).eval().cpu()
     engine: Engine
     if device == 'cpu':
@@ -74,6 +75,18 @@ def make_engine(network: nn.Module, device: str = 'auto', num_threads: int | Non
         engine = _on(device, lambda: TorchEngine(pipeline, device))
     _log.info('runs on %s (%s)', engine.name, why)
     return engine
+
+
+def _chosen() -> tuple[str, str]:
+    """The device that 'auto' stands for, and why."""
+    if not torch.cuda.is_available():
+        return 'cpu', 'no GPU was found'
+    try:
+        check_device('cuda')
+    except HandPoseError as error:  # it is too old for this PyTorch, for example, or full
+        _log.warning('a hand takes longer than it could, as the network runs on the CPU: %s', error)
+        return 'cpu', 'the GPU cannot be used'
+    return 'cuda', 'a GPU was found'
 
 
 def check_device(device: str) -> None:
@@ -93,5 +106,6 @@ def _on(device: str, work: Callable[[], _T]) -> _T:
     try:
         return work()
     except (RuntimeError, AssertionError) as error:  # either, depending on what the device lacks
+        remedy = "'cpu', or a PyTorch for this GPU" if device == 'cuda' else "'cpu' or 'cuda'"
         raise HandPoseError(f"device '{device}' cannot be used here ({str(error).splitlines()[0]}): "
-                            "use 'cpu' or 'cuda'") from error
+                            f'use {remedy}') from error

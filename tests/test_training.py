@@ -744,6 +744,14 @@ def test_a_device_that_is_not_there_is_told_before_the_work(folder, tmp_path):
         tiny(folder, out=tmp_path, device='quantum')
 
 
+@pytest.mark.parametrize('device', ['cuda', 'cuda:0'])
+def test_a_process_of_torchrun_without_a_gpu_says_so(folder, tmp_path, device, monkeypatch, capsys):
+    for name, value in {'RANK': 0, 'WORLD_SIZE': 99, 'LOCAL_RANK': 98}.items():
+        monkeypatch.setenv(name, str(value))
+    assert main([*command(folder, tmp_path / 'run'), '--device', device]) == 1
+    assert "device 'cuda:98' " in capsys.readouterr().err
+
+
 def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_batch(folder, tmp_path):
     run = tiny(folder, 'learning_rate=1e30', out=tmp_path)
     with pytest.raises(TrainingError, match=r'step \d+ is not finite .* learning_rate below 1e\+30'):

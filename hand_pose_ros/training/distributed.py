@@ -9,16 +9,23 @@ from contextlib import contextmanager
 import torch
 import torch.distributed as dist
 
+from hand_pose_ros.runtime import check_device
+
 
 @contextmanager
 def process_group(device: str) -> Iterator[None]:
-    """Join the processes that torchrun started, if it did."""
+    """Join the processes that torchrun started, if it did.
+
+    Raises:
+        HandPoseError: there is no GPU for this process.
+    """
     if 'RANK' not in os.environ:
         yield
         return
-    if device == 'cuda':
-        torch.cuda.set_device(int(os.environ['LOCAL_RANK']))
-    dist.init_process_group('nccl' if device == 'cuda' else 'gloo')
+    if device.startswith('cuda'):
+        check_device(own := f'cuda:{os.environ["LOCAL_RANK"]}')
+        torch.cuda.set_device(own)
+    dist.init_process_group('nccl' if device.startswith('cuda') else 'gloo')
     try:
         yield
         dist.barrier()  # the first process validates alone at the end: nobody takes the group down under its feet

@@ -17,7 +17,7 @@ import torch
 from hand_pose_ros.files import write_json
 from hand_pose_ros.models.checkpoints import load_checkpoint
 from hand_pose_ros.runtime import make_engine
-from hand_pose_ros.runtime.cuda_engine import WARM_UP, CudaEngine
+from hand_pose_ros.runtime.cuda_engine import WARM_UP, CudaEngine, exact_convolutions
 from hand_pose_ros.runtime.engine import Pipeline, TorchEngine
 from hand_pose_ros.runtime.timing import measure, some_patches
 
@@ -28,7 +28,7 @@ BATCHES = (64, 1024, 4096)
 def graph_alone(engine: CudaEngine, replays: int = 500) -> float:
     """Milliseconds of a replay whose input and output stay on the GPU."""
     source = some_patches(1).to(engine.device)
-    with torch.inference_mode(), torch.cuda.stream(engine.stream):
+    with torch.inference_mode(), torch.cuda.stream(engine.stream), exact_convolutions():
         for _ in range(WARM_UP):
             engine.pipeline(source)
         engine.stream.synchronize()

@@ -17,7 +17,7 @@ from hand_pose_ros.models import build
 from hand_pose_ros.models.checkpoints import load_checkpoint
 from hand_pose_ros.models.dense import HandDense
 from hand_pose_ros.runtime import cuda_engine, default_threads, make_engine
-from hand_pose_ros.runtime.cuda_engine import LARGEST, CudaEngine, _Captured
+from hand_pose_ros.runtime.cuda_engine import LARGEST, CudaEngine, _Captured, exact_convolutions
 from hand_pose_ros.runtime.engine import Pipeline, TorchEngine
 from hand_pose_ros.runtime.fused import fuse
 from hand_pose_ros.runtime.lanes import PairedConvolution, fill_lanes
@@ -318,6 +318,20 @@ def test_what_is_wrong_or_fails_on_a_gpu_is_done_without(name, moved, used, said
     if used == 'pytorch':
         patches = hand_patches(1)
         np.testing.assert_array_equal(engine.run(patches), TorchEngine(Pipeline(network).eval()).run(patches))
+
+
+@pytest.mark.skipif(not hasattr(torch.backends.cudnn, 'conv'), reason='PyTorch knows these settings since 2.9')
+@pytest.mark.parametrize(('all_of_it', 'convolutions'), [('none', 'tf32'), ('none', 'ieee'), ('tf32', 'tf32')])
+def test_convolutions_are_exact_whatever_a_program_has_chosen_which_stays(all_of_it, convolutions):
+    backends, conv = torch.backends, torch.backends.cudnn.conv
+    before = backends.fp32_precision, conv.fp32_precision
+    backends.fp32_precision, conv.fp32_precision = all_of_it, convolutions
+    try:
+        with exact_convolutions():
+            assert conv.fp32_precision == 'ieee'
+        assert (backends.fp32_precision, conv.fp32_precision) == (all_of_it, convolutions)
+    finally:
+        backends.fp32_precision, conv.fp32_precision = before
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason='needs a CUDA GPU')

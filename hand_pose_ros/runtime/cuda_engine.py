@@ -5,8 +5,11 @@ from __future__ import annotations
 import copy
 import logging
 from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import torch
@@ -88,9 +91,7 @@ class CudaEngine(Engine):
 
     def _capture(self, size: int) -> _Captured:
         source = torch.ones(size, 1, PATCH_SIZE, PATCH_SIZE, dtype=self.pipeline.precision, pin_memory=True)
-        # Nor may what is not halved be rounded as much by the convolutions of a tensor core.
-        exact = torch.backends.cudnn.flags(enabled=True, allow_tf32=False)
-        with torch.inference_mode(), torch.cuda.device(self.device), exact:
+        with torch.inference_mode(), torch.cuda.device(self.device), exact_convolutions():
             with torch.cuda.stream(self.stream):
                 for _ in range(WARM_UP):
                     answer = self._compute(source)
@@ -104,6 +105,21 @@ class CudaEngine(Engine):
 
     def _compute(self, source: Tensor) -> tuple[Tensor, ...]:
         return self.pipeline(source.to(self.device, non_blocking=True))
+
+
+@contextmanager
+def exact_convolutions() -> Iterator[None]:
+    """What is not halved may not be rounded as much by the convolutions of a tensor core, either."""
+    cudnn: Any = torch.backends.cudnn
+    # In a process that uses what PyTorch has for this since 2.9, nobody can use the older flag, nor `cudnn.flags`.
+    owner, name, exact = (cudnn.conv, 'fp32_precision', 'ieee') if hasattr(cudnn, 'conv') else (
+        cudnn, 'allow_tf32', False)
+    before = getattr(owner, name)
+    setattr(owner, name, exact)
+    try:
+        yield
+    finally:
+        setattr(owner, name, before)
 
 
 def fastest(pipeline: Pipeline, device: str) -> Engine:

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 from hand_pose_ros.cli import VERBS, main
 from hand_pose_ros.resources import resource
@@ -20,6 +21,20 @@ def test_every_verb_has_help_with_examples(verb, capsys):
         main([verb, '--help'])
     assert exit_.value.code == 0
     assert f'hand-pose {verb}' in capsys.readouterr().out.split('examples:')[1]
+
+
+@pytest.mark.parametrize(('arguments', 'remedy'), [
+    (['synth', 'write', 'hands', '--number', '1'], '--device cpu'), (['train', 'paper', '--out', 'run'], 'batch_size')])
+def test_a_gpu_without_enough_memory_is_told(arguments, remedy, monkeypatch, tmp_path, capsys):
+    def full(device):
+        raise torch.cuda.OutOfMemoryError('CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has 1 GiB.')
+    monkeypatch.chdir(tmp_path)
+    for where in ('hand_pose_ros.runtime', 'hand_pose_ros.training.loop'):
+        monkeypatch.setattr(f'{where}.check_device', full)
+    assert main([*arguments, '--device', 'cuda']) == 1
+    said = capsys.readouterr().err
+    assert said.startswith(f'hand-pose {arguments[0]}: CUDA out of memory: end what else uses the GPU')
+    assert remedy in said and said.count('\n') == 1
 
 
 def test_names_of_sensors_are_in_the_help(capsys):

@@ -128,6 +128,14 @@ def main(argv: Sequence[str] | None = None) -> int:
             what += ', and a folder is needed: give another name'
         print(f'hand-pose {args.verb}: {what}', file=sys.stderr)
         return 1
+    except RuntimeError as error:
+        if type(error).__name__ != 'OutOfMemoryError':  # of PyTorch, which most verbs need not import
+            raise
+        less = '--device cpu' if args.verb not in ('train', 'experiment') else (
+            'a lower --set batch_size, and --workers 1 or more')
+        print(f'hand-pose {args.verb}: {str(error).partition(". ")[0]}: end what else uses the GPU, or give {less}',
+              file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         print(f'hand-pose {args.verb}: interrupted', file=sys.stderr)
         return 1

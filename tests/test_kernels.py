@@ -14,7 +14,7 @@ pytest.importorskip('triton', reason='needs Triton, which comes with PyTorch for
 
 from hand_pose_ros.models import build  # noqa: E402
 from hand_pose_ros.models.refiner import FAR, _framed, cut  # noqa: E402
-from hand_pose_ros.runtime import kernels  # noqa: E402
+from hand_pose_ros.runtime import cuda_engine, kernels  # noqa: E402
 from hand_pose_ros.runtime.fused import ConvolutionReLU, LinearReLU, fuse  # noqa: E402
 
 
@@ -71,3 +71,8 @@ def test_few_hands_are_computed_by_them_and_many_give_the_same():
     assert isinstance(layers[4], LinearReLU)
     torch.testing.assert_close(layers(x), expected, rtol=0, atol=1e-5)
     torch.testing.assert_close(layers(x[:2]), expected[:2], rtol=0, atol=1e-5)
+
+
+def test_a_gpu_does_without_kernels_that_are_interpreted(caplog):
+    assert (cuda_engine._own_kernels() is kernels) == ('TRITON_INTERPRET' not in os.environ)
+    assert ('TRITON_INTERPRET is set' in caplog.text) == ('TRITON_INTERPRET' in os.environ)

@@ -146,10 +146,13 @@ def _own_kernels() -> ModuleType | None:
     """`runtime.kernels`, where there is Triton, which PyTorch for CUDA brings along on Linux."""
     try:
         from hand_pose_ros.runtime import kernels
+        if kernels.COMPILED:
+            return kernels
+        problem = 'TRITON_INTERPRET is set, and no CUDA graph can hold what is interpreted'
     except ImportError as error:
-        _log.warning('a hand takes longer than it could, as kernels cannot be compiled here: %s', error)
-        return None
-    return kernels
+        problem = str(error)
+    _log.warning('a hand takes longer than it could, as kernels cannot be compiled here: %s', problem)
+    return None
 
 
 def _agree(engine: Engine, plain: Engine) -> bool:

@@ -101,6 +101,10 @@ def _between(first, second, fraction):
     return first + (second - first) * fraction
 
 
+COMPILED = isinstance(_cut, triton.JITFunction)
+"""And not interpreted on the CPU, as with TRITON_INTERPRET=1."""
+
+
 def fits(layer: nn.Conv2d, pool: int) -> bool:
     """Whether `convolve` can compute it, and is worth it: few filters in a group, as tensor cores want many."""
     each = layer.out_channels // layer.groups

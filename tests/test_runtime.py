@@ -300,7 +300,7 @@ def test_what_is_wrong_or_fails_on_a_gpu_is_done_without(name, moved, used, said
         def __init__(self, pipeline: Pipeline, device: str, kernels: object) -> None:
             self.name = 'own' if kernels else 'none'
             if self.name not in moved:
-                raise ValueError('no kernel image\nand ten lines more')
+                raise ValueError('\nno kernel image\nand ten lines more')  # as NVRTC's begin
             super().__init__(pipeline)
 
         def run(self, patches: np.ndarray) -> np.ndarray:

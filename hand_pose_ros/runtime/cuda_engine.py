@@ -134,7 +134,7 @@ def fastest(pipeline: Pipeline, device: str) -> Engine:
             engine = CudaEngine(copy.deepcopy(pipeline), device, kernels)
             problem = '' if _agree(engine, plain) else 'the joints are not those of the CPU'
         except Exception as error:  # PyTorch, CUDA and Triton have errors of their own
-            problem = (str(error) or type(error).__name__).splitlines()[0]
+            problem = (str(error).strip() or type(error).__name__).splitlines()[0]
         if not problem:
             return engine
         _log.warning('a hand takes longer than it could, as %s cannot be used on %s: %s',

@@ -207,7 +207,7 @@ def decode_rvl(data: bytes | memoryview) -> NDArray[np.uint16]:
 
     payload = np.frombuffer(data, np.uint8, offset=8)
     octets = payload[:len(payload) // 4 * 4].view('<u4').astype('>u4').view(np.uint8)
-    nibbles = np.stack([octets >> 4, octets & 15], axis=1).ravel()
+    nibbles: NDArray[np.uint8] = np.stack([octets >> 4, octets & 15], axis=1).ravel()
     ends = np.flatnonzero(nibbles < 8)
     groups = np.diff(ends, prepend=-1)
     if len(groups) == 0 or groups.max() > 11:

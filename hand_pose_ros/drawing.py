@@ -99,7 +99,7 @@ def overlay(depth: NDArray[np.float32], intrinsics: Intrinsics, hands: Sequence[
         height: of the picture, pixels.
     """
     width = np.clip(depth.shape[1] * height / depth.shape[0], height / 4, 16 * height)  # of one row, it had no end
-    whole = _View(depth, intrinsics, (0, 0), depth.shape[::-1], (round(width), height))
+    whole = _View(depth, intrinsics, (0, 0), (depth.shape[1], depth.shape[0]), (round(width), height))
     picture = whole.shade()
     for hand in hands:
         draw_cube(picture, hand.cube, whole.intrinsics)

@@ -29,8 +29,13 @@ def learned(confidence: NDArray[np.float32], hand: NDArray[np.float32],
     The score is the share of joints that can be expected to be right: the probability that this is a hand, times the
     mean confidence of its joints. Either alone lets things pass that the other knows to be wrong.
     """
-    confidence, hand = (0.5 * (1 + np.tanh(0.5 * logits)) for logits in (confidence, hand))
+    confidence, hand = _sigmoid(confidence), _sigmoid(hand)
     return confidence, hand * confidence.mean(axis=1)
+
+
+def _sigmoid(logits: NDArray[np.float32]) -> NDArray[np.float32]:
+    half = np.float32(0.5)
+    return half + half * np.tanh(half * logits)
 
 
 def explain(patch: NDArray[np.float32], joints: NDArray[np.floating], side: float,

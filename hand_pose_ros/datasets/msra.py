@@ -108,7 +108,7 @@ def _read_gesture(folder: Path) -> list[tuple[Path, np.ndarray]]:
             raise ValueError(f'{len(joints)} of {lines[0].strip()} lines')
     except ValueError as error:  # a UnicodeDecodeError is one
         raise DatasetError(f'MSRA: {labels} is damaged ({error}); copy or download it again') from error
-    joints = joints * (0.001, -0.001, -0.001)  # mm, y up, z towards the viewer -> m, optical frame
+    joints *= (0.001, -0.001, -0.001)  # mm, y up, z towards the viewer -> m, optical frame
     faulty = FAULTY.get((folder.parent.name, folder.name), set())
     frames = []
     for path in sorted(folder.glob('*_depth.bin')):

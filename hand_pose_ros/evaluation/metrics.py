@@ -63,7 +63,7 @@ def median_mm(errors_mm: ArrayLike) -> float:
 def max_mm(errors_mm: ArrayLike) -> float:
     """The largest error of any single joint that was predicted and scored; NaN if there is none."""
     found = _found(errors_mm)
-    return float(found.max()) if found.size else float('nan')
+    return float(np.max(found)) if found.size else float('nan')
 
 
 def frame_means_mm(errors_mm: ArrayLike) -> Floats:
@@ -182,7 +182,7 @@ def percentiles(values: ArrayLike) -> dict[str, float]:
         return {}
     p50, p90, p99 = np.percentile(found, [50, 90, 99])
     return {'mean': float(found.mean()), 'p50': float(p50), 'p90': float(p90), 'p99': float(p99),
-            'max': float(found.max())}
+            'max': float(np.max(found))}
 
 
 def paired_bootstrap(a_mm: ArrayLike, b_mm: ArrayLike, *, block: int = 30, resamples: int = 10_000,

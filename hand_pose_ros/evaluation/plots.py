@@ -151,7 +151,7 @@ def _entry(result: Result) -> str:
 
 def _time_axis(result: Result) -> tuple[NDArray[np.float64], str]:
     if result.stamps_ns is None or len(result.stamps_ns) < 2 or (np.diff(result.stamps_ns) <= 0).any():
-        return np.arange(1.0, len(result.predictions) + 1), 'frame'
+        return np.arange(1, len(result.predictions) + 1, dtype=np.float64), 'frame'
     return (result.stamps_ns - result.stamps_ns[0]) / 1e9, 'time, s'
 
 

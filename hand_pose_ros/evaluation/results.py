@@ -22,8 +22,8 @@ from hand_pose_ros.skeleton import Skeleton
 
 FORMAT = 1
 """Raised when files of the old form can no longer be read."""
-DAMAGE = (BadZipFile, EOFError, KeyError, NotImplementedError, TypeError, ValueError, zlib.error)
-"""What reading an .npz file raises that is damaged, or of another kind."""
+DAMAGE = (AttributeError, BadZipFile, EOFError, KeyError, NotImplementedError, TypeError, ValueError, zlib.error)
+"""What reading an .npz file raises that is damaged, or of another kind (AttributeError: with Python 3.10)."""
 
 
 @dataclass(frozen=True)

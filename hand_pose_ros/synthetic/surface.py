@@ -86,7 +86,7 @@ def _finger(rest: RestHand, p: Array, digit: int) -> Array:
     lengths, radii = rest.segments[digit], rest.radii[digit]
     tip = FINGER_END * radii[2]
     first = 1 if digit == 0 else 0
-    d = np.full(len(p), np.inf)
+    d: Array = np.full(len(p), np.inf)
     for i in range(first, 3):
         q, length, r = rest.local(p, bones[i]), lengths[i], radii[i]
         if i < 2:
@@ -106,7 +106,7 @@ def _palm(rest: RestHand, p: Array) -> Array:
     """Distance to the palm with its pads, hollow and finger webs, without the thumb."""
     depth, b, length = rest.palm_depth, rest.breadth, rest.length
     roots = [rest.origins[DIGIT[i]] for i in range(5)]
-    d = np.full(len(p), np.inf)
+    d: Array = np.full(len(p), np.inf)
     # Metacarpals, close under the skin of the back.
     for i in range(1, 5):
         q = rest.local(p, METACARPAL[i])

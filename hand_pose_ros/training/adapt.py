@@ -90,9 +90,10 @@ class Look:
     def split(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """The images to learn from and those to judge on, (images,) bool each, by time."""
         assert self.result.stamps_ns is not None
-        time = (self.result.stamps_ns - self.result.stamps_ns.min()) / 1e9
-        end = float(time.max()) * (1 - HELD_OUT)
-        return time < end - min(GAP_S, GAP * float(time.max())), time >= end
+        time = (self.result.stamps_ns - np.min(self.result.stamps_ns)) / 1e9
+        whole = float(np.max(time))
+        end = whole * (1 - HELD_OUT)
+        return time < end - min(GAP_S, GAP * whole), time >= end
 
 
 class _Crops:

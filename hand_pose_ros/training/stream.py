@@ -47,7 +47,7 @@ class SampleStream:
         rank, world = self.part
         share = self.batch_size // world
         start = step * self.batch_size + rank * share
-        numbers = np.arange(start, start + share)
+        numbers: NDArray[np.int64] = np.arange(start, start + share)
         parts: list[Batch] = []
         while len(numbers):
             stage, offset, size = self._locate(int(numbers[0]))

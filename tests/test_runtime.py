@@ -329,6 +329,7 @@ def test_convolutions_are_exact_whatever_a_program_has_chosen_which_stays(all_of
     try:
         with exact_convolutions():
             assert conv.fp32_precision == 'ieee'
+            assert not backends.cudnn.allow_tf32  # nor does reading it, as convolutions do, find the two at odds
         assert (backends.fp32_precision, conv.fp32_precision) == (all_of_it, convolutions)
     finally:
         backends.fp32_precision, conv.fp32_precision = before

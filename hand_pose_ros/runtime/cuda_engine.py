@@ -111,15 +111,22 @@ class CudaEngine(Engine):
 def exact_convolutions() -> Iterator[None]:
     """What is not halved may not be rounded as much by the convolutions of a tensor core, either."""
     cudnn: Any = torch.backends.cudnn
-    # In a process that uses what PyTorch has for this since 2.9, nobody can use the older flag, nor `cudnn.flags`.
-    owner, name, exact = (cudnn.conv, 'fp32_precision', 'ieee') if hasattr(cudnn, 'conv') else (
-        cudnn, 'allow_tf32', False)
-    before = getattr(owner, name)
-    setattr(owner, name, exact)
+    settings: list[tuple[Any, str, Any]] = [(cudnn, 'allow_tf32', False)]
+    if hasattr(cudnn, 'conv'):  # what PyTorch has since 2.9, and which has to agree with the older flag
+        settings += [(cudnn.conv, 'fp32_precision', 'ieee'), (cudnn.rnn, 'fp32_precision', 'ieee')]
+    before = []
+    for owner, name, _ in settings:
+        try:
+            before.append(getattr(owner, name))
+        except RuntimeError:  # a program has chosen in the new way, and nobody can read the flag, which is as it was
+            before.append(True)
+    for owner, name, exact in settings:
+        setattr(owner, name, exact)
     try:
         yield
     finally:
-        setattr(owner, name, before)
+        for (owner, name, _), value in zip(settings, before, strict=True):
+            setattr(owner, name, value)
 
 
 def fastest(pipeline: Pipeline, device: str) -> Engine:

@@ -82,6 +82,7 @@ class EstimatorNode(LifecycleNode):
         self._latched: Subscription | None = None  # to a camera_info that was published before the node came
         self._published = False  # does anybody publish images?
         self._info_stamp = -1  # of the newest camera_info, ns
+        self._last_header = Header()  # of the image before
         self._reset = False  # asked for; the worker, who alone touches the estimator, does it
         super().__init__('estimator', **kwargs)
         self._change_state = self._service_change_state.callback
@@ -166,7 +167,7 @@ class EstimatorNode(LifecycleNode):
         raw = self._params.transport == 'raw'
         self._image_type, self._decode = (Image, decode_image) if raw else (CompressedImage, decode_compressed)
         self._camera.open()
-        self._last_header, self._reset = Header(), True  # whoever is there now need not be who was there before
+        self._reset = True  # whoever is there now need not be who was there before
         self._heard_at, self._statistics.silence = time.monotonic(), ''
         inputs = [(CameraInfo, self._camera.topic, self._on_camera_info),
                   (self._image_type, self._image_topic, self._on_image)]

@@ -40,6 +40,7 @@ from hand_pose_ros.msg import HandJointsArray, HandSkeleton  # noqa: E402
 from hand_pose_ros.ros import conversions  # noqa: E402
 from hand_pose_ros.ros import node as node_module  # noqa: E402
 from hand_pose_ros.ros.node import EstimatorNode  # noqa: E402
+from hand_pose_ros.ros.worker import NewestWorker  # noqa: E402
 from hand_pose_ros.skeleton import HAND21  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures('ros_domain')
@@ -353,9 +354,13 @@ def test_unknown_weights_are_named_and_can_be_corrected(rig: Rig) -> None:
     assert rig.state() == 'unconfigured'
     rig.until_said('/nowhere/weights.safetensors')
     rig.until_said('the node does nothing')
+    reports = rig.received[DiagnosticArray]
+    rig.until(lambda: reports and reports[-1].status[0].level == b'\x02', 'an error')
+    assert '/nowhere/weights.safetensors' in reports[-1].status[0].message
     assert rig.set_parameter('model', str(rig.weights))[0]
     assert rig.transition('configure') and rig.transition('activate')
     assert rig.answer(rig.camera(info=camera_info()), image(depth_with_hand())).hands
+    rig.until(lambda: reports[-1].status[0].level == b'\x00', 'the error to be gone')
 
 
 def test_enable_and_reset(rig: Rig) -> None:
@@ -364,13 +369,18 @@ def test_enable_and_reset(rig: Rig) -> None:
     first = rig.answer(publish, image(depth_with_hand(), 1)).hands[0].id
     assert rig.answer(publish, image(depth_with_hand(), 2)).hands[0].id == first
     assert rig.call(Trigger, 'reset').success
-    assert rig.answer(publish, image(depth_with_hand(), 3)).hands[0].id != first
+    second = rig.answer(publish, image(depth_with_hand(), 3)).hands[0].id
+    assert second != first
 
-    assert rig.call(SetBool, 'enable', data=False).success
+    assert rig.call(SetBool, 'enable', data=False).message == 'disabled'
     rig.until(lambda: rig.client.count_subscribers('/depth/image_rect') == 0)
-    rig.until(lambda: any(m.action == Marker.DELETE for m in rig.received[MarkerArray][-1].markers), 'deletions')
+    rig.until(lambda: {(m.ns.split('/')[0], m.action) for m in rig.received[MarkerArray][-1].markers}
+              == {(second, Marker.DELETE)}, 'deletions')
+    reports = rig.received[DiagnosticArray]
+    rig.until(lambda: reports and reports[-1].status[0].message == 'the node is disabled', 'diagnostics')
     assert rig.call(SetBool, 'enable', data=True).success
-    assert rig.answer(rig.camera(), image(depth_with_hand(), 4)).hands  # the camera_info is known already
+    hand, = rig.answer(rig.camera(), image(depth_with_hand(), 4)).hands  # the camera_info is known already
+    assert hand.id not in (first, second)  # somebody else may be there by now
 
 
 def test_a_bag_that_begins_again_is_a_new_hand(rig: Rig) -> None:
@@ -441,14 +451,14 @@ def test_smoothing_holds_a_hand_still_that_jumps(rig: Rig) -> None:
     publish = rig.camera(info=camera_info())
     tip = HAND21.joint_names.index('index_tip')
 
-    def jump() -> float:
+    def jump(seconds: float = 0.033) -> float:
         before, after = (rig.answer(publish, image(depth_with_hand(z), stamp)).hands[0].joints[tip].z
-                         for z, stamp in ((0.6, 1000), (0.62, 1033)))
+                         for z, stamp in ((0.6, 1000), (0.62, 1000 + round(1000 * seconds))))
         return abs(after - before)
 
-    smooth = jump()
+    smooth, slow = jump(), jump(seconds=4.0)  # by the stamps
     assert rig.set_parameter('smoothing', 0.0)[0]
-    assert smooth < 0.5 * jump()
+    assert smooth < 0.5 * jump() < slow
 
 
 def test_without_camera_info_the_remedy_is_named_and_works(rig: Rig) -> None:
@@ -476,24 +486,26 @@ def test_camera_info_that_was_published_once_before_the_node_came_is_taken(rig: 
     assert answers[0].hands
     # One that is published all the time is heard beside it, without a word about quality of service.
     rig.until(lambda: rig.node._latched, 'the node to listen to what is kept')
+    assert rig.transition('deactivate') and not list(rig.node.subscriptions) and rig.transition('activate')
+    rig.until(lambda: rig.node._latched in rig.node.subscriptions, 'the node to listen to it again')
     infos = rig.client.create_publisher(CameraInfo, 'depth/camera_info', BEST_EFFORT)
     rig.connected(infos)
     infos.publish(camera_info(WIDTH // 2, HEIGHT // 2, FOCAL / 2))
     assert rig.answer(publish, image(depth_with_hand()[::2, ::2])).hands
     assert rig.transition('deactivate') and rig.transition('activate')
-    rig.until(lambda: sum('listening to' in text for text in rig.said()) == 2, 'to hear all that was said before')
+    rig.until(lambda: sum('listening to' in text for text in rig.said()) == 3, 'to hear all that was said before')
     assert not any('incompatible' in text for text in rig.said())
 
 
 def test_a_machine_is_not_called_slow_while_camera_info_is_missing(rig: Rig) -> None:
-    rig.start(camera_info_timeout=1.5)  # images that wait are replaced by newer ones
+    rig.start(camera_info_timeout=1.5, publish_diagnostics=False)  # images that wait are replaced by newer ones
     publish, picture = rig.camera(RELIABLE), image(depth_with_hand())
     end = time.monotonic() + 3.5
     while time.monotonic() < end:
         publish(picture)
         time.sleep(0.02)
     rig.until_said('/depth/camera_info')
-    assert not any('too slow' in text for text in rig.said())
+    assert not any('too slow' in text for text in rig.said()) and not rig.received[DiagnosticArray]
 
 
 def test_nor_where_camera_info_is_wrong_now_and_then(rig: Rig) -> None:
@@ -539,6 +551,7 @@ def test_to_stop_while_an_image_waits_for_its_camera_info_is_no_complaint(rig: R
     assert rig.transition('deactivate') and rig.transition('activate')
     rig.until(lambda: sum('listening to' in text for text in rig.said()) == 2, 'to hear all that was said before')
     assert not any('camera_info arrived' in text for text in rig.said())
+    assert rig.node._statistics._totals['dropped'] == 1  # each image is answered, refused or dropped
     assert rig.answer(rig.camera(info=camera_info()), image(depth_with_hand())).hands
 
 
@@ -648,12 +661,12 @@ def test_who_has_just_come_is_not_said_to_be_missing(rig: Rig, monkeypatch: pyte
     monkeypatch.setattr(node_module, 'SILENCE_S', 0.5)
     rig.start()
 
-    def newest() -> str:
-        return rig.received[DiagnosticArray][-1].status[0].message if rig.received[DiagnosticArray] else ''
-    rig.until(lambda: 'without any publisher' in newest(), 'the silence to be told')
-    monkeypatch.setattr(node_module, 'SILENCE_S', 60.0)
+    reports = rig.received[DiagnosticArray]
+    rig.until(lambda: reports and 'without any publisher' in reports[-1].status[0].message, 'the silence to be told')
+    before = len(reports)
     rig.client.create_publisher(Image, 'depth/image_rect', BEST_EFFORT)
-    rig.until(lambda: newest() == 'no images', 'the publisher to be seen')
+    rig.until(lambda: any(report.status[0].message == 'no images' for report in reports[before:]),
+              'the publisher to be seen, and given its time')
 
 
 def test_depth_that_is_only_raw_is_found(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -728,17 +741,25 @@ def test_diagnostics_tell_rates_times_and_hints(rig: Rig) -> None:
 
     def newest() -> dict[str, str]:
         status = rig.received[DiagnosticArray][-1].status[0]
-        return {'message': status.message, 'level': status.level, **{v.key: v.value for v in status.values}}
+        return {'name': status.name, 'message': status.message, 'level': status.level,
+                **{v.key: v.value for v in status.values}}
 
-    for stamp in range(5):
+    for stamp in (*range(4), time.time_ns() // 1_000_000):  # the others are from a bag, of whatever age
         rig.answer(publish, image(depth_with_hand(), stamp))
     rig.until(lambda: rig.received[DiagnosticArray] and newest().get('answered_total') == '5', 'diagnostics')
     report = newest()
-    assert report['received_total'] == '5' and report['dropped_total'] == '0' and report['state'] == 'active'
-    assert {'decode_p50_ms', 'predict_p50_ms', 'total_p95_ms', 'input_hz', 'output_hz'} <= report.keys()
+    assert report['received_total'] == report['hands_total'] == '5' and report['dropped_total'] == '0'
+    assert {'decode_p50_ms', 'predict_p50_ms', 'total_p95_ms', 'age_p50_ms', 'input_hz', 'output_hz'} <= report.keys()
+    assert {key: report[key] for key in ('name', 'state', 'model', 'detector', 'intrinsics')} == {
+        'name': 'estimator: hand pose', 'state': 'active', 'model': str(rig.weights), 'detector': 'nearest',
+        'intrinsics': '/depth/camera_info'}
+    assert report['engine'] == rig.node._estimator.engine.name
+    assert report['image'].startswith('/depth/image_rect published by /client (sensor_msgs/msg/Image, best effort')
+    assert rig.received[DiagnosticArray][-1].header.stamp.sec > 0
     assert report['level'] == b'\x00'
     publish(Image(encoding='rgb8', width=1, height=1, step=3, data=array('B', b'abc')))
     rig.until(lambda: 'rgb8' in newest()['message'] and newest()['level'] == b'\x01', 'a warning')
+    assert newest()['refused_total'] == '1' and newest()['answered_total'] == '5'
     rig.until(lambda: newest()['level'] == b'\x03', 'staleness')
 
 
@@ -790,6 +811,28 @@ def test_a_slow_network_gets_the_newest_image_never_a_queue(rig: Rig, monkeypatc
     rig.until(lambda: len(rig.received[HandJointsArray]) == 3)
     time.sleep(0.1)
     assert [stamp_of(a) for a in rig.received[HandJointsArray]] == [1, 2, 9]
+    go.clear()
+    rig.until(lambda: publish(image(depth_with_hand(), 10)) or any('too slow' in text for text in rig.said()),
+              'the log to say so')
+    go.set()
+
+
+def test_to_stop_is_to_finish_what_is_in_flight_and_to_forget_what_waits() -> None:
+    entered, go, done = threading.Event(), threading.Event(), []
+
+    def handle(item: int) -> None:
+        entered.set()
+        go.wait(20)
+        done.append(item)
+
+    worker = NewestWorker(handle)
+    assert not worker.put(1) and entered.wait(10) and not worker.put(2)
+    stopping = threading.Thread(target=lambda: (worker.stop(), done.append('stopped')))
+    stopping.start()
+    stopping.join(0.1)  # in which it must not end
+    go.set()
+    stopping.join()
+    assert done == [1, 'stopped']
 
 
 def test_many_activations_leave_nothing_behind(rig: Rig) -> None:

@@ -682,6 +682,30 @@ def test_a_validation_that_fails_costs_no_training_and_is_made_up_for(folder, tm
     assert validations(tmp_path / 'failed') == validations(tmp_path / 'whole')
 
 
+def test_a_run_that_goes_on_keeps_its_best_weights_and_tells_of_other_data(folder, tmp_path, monkeypatch, caplog):
+    errors = iter((0.009, 0.019))
+
+    def validate(*_) -> tuple[torch.Tensor, torch.Tensor]:
+        error = next(errors)  # and of one joint more, as of the worst
+        return torch.tensor([[[error, 0, 0]] * 15 + [[error + 0.016, 0, 0]]]), torch.zeros(1, 16, 3)
+    monkeypatch.setattr('hand_pose_ros.training.loop.estimate', validate)
+    first, again = (tiny(folder, 'samples=80', out=tmp_path) for _ in range(2))
+    stop_after(first, 15)
+    with pytest.raises(TrainingError, match='after 60 samples'):
+        first.train()
+    again.shards.dataset.fingerprint = 'another'
+    again.train(resume=True)
+    assert 'the training data, or the code that makes them, have changed since step 15' in caplog.text
+    for name, samples, *told in (('best', 40, 10, 0, 1, 1), ('last', 80, 20, 0, 0, 1)):
+        facts = load_checkpoint(tmp_path / f'{name}.safetensors').metadata
+        assert facts['samples'] == samples
+        assert facts['validation'] == dict(zip(('val_mm', 'val_within_20', 'val_within_30', 'val_within_40'), told,
+                                               strict=True))
+    caplog.clear()
+    tiny(folder, 'samples=80', out=tmp_path).train(resume=True)
+    assert f'the run in {tmp_path} is finished already' in caplog.text
+
+
 def validations(run: Path) -> list[dict]:
     return [row for row in map(json.loads, (run / 'metrics.jsonl').open()) if 'val_mm' in row]
 
@@ -988,6 +1012,12 @@ def test_experiments_train_what_is_missing_and_write_table_plot_and_json(folder,
     monkeypatch.setattr(experiments, 'TEST_SAMPLES', 4)  # fewer than there are recorded ones: those are all taken
     changes = (*TINY, 'options.dropout=0.1', f'root={folder}', 'samples=24', 'last_shard=3')
     sets = [part for item in changes for part in ('--set', item)]
+    recipe = get_recipe('paper', changes)
+    begun = Run(tmp_path / 'runs' / 'deep-8', replace(
+        recipe, network='deep', options={**recipe.options, 'bottleneck': 8}), Machine(folder / 'cache', workers=0))
+    stop_after(begun, 3)
+    with pytest.raises(TrainingError, match='an experiment goes on by the same command'):
+        begun.train()
     monkeypatch.chdir(tmp_path.parent)
     arguments = ['--out', tmp_path.name, '--workers', '0', '--threads', '1', *sets]
     for name in ('bottleneck', 'refinement', 'joints', 'qualitative', 'runtime'):

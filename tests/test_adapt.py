@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from hand_pose_ros.cli import main
 from hand_pose_ros.datasets import joints_in_metres
 from hand_pose_ros.estimator import HandEstimate, HandPoseEstimator
 from hand_pose_ros.evaluation.metrics import bone_drift_mm
+from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.geometry import Cube, Intrinsics
 from hand_pose_ros.models import build
 from hand_pose_ros.models.checkpoints import WEIGHTS, load_checkpoint, save_checkpoint
@@ -25,7 +27,7 @@ from hand_pose_ros.synthetic.rng import Random
 from hand_pose_ros.synthetic.shapes import sample_shapes
 from hand_pose_ros.synthetic.stages import Ingredients
 from hand_pose_ros.training import adapt, fitting
-from hand_pose_ros.training.adapt import consensus, fine_tune, is_better
+from hand_pose_ros.training.adapt import Look, _Crops, consensus, fine_tune, is_better, judge
 from hand_pose_ros.training.fitting import fit_hand
 
 pytestmark = pytest.mark.usefixtures('one_thread')
@@ -216,6 +218,42 @@ def test_depth_pulls_the_hand_to_where_it_was_measured(moving_hand):
 
 # Training and judgement
 
+def test_what_is_judged_on_is_held_out_and_a_while_after_what_is_learned_from():
+    stamps, truth = np.arange(100) * 10**9, np.zeros((100, 21, 3))
+    wrong = truth + np.where(np.arange(100) < 75, 0.5, 0.01)[:, None, None] * [1, 0, 0]
+    crops = {'patch': torch.zeros(0, 1, 128, 128), 'joints': torch.zeros(0, 21, 3), 'cube_side': torch.zeros(0)}
+    result = Result('bag', HAND21, Intrinsics(140, 140, 80, 60, 160, 120), wrong, truth, stamps)
+    found = Look(result, torch.zeros(0, dtype=torch.int64), crops)
+    assert [np.flatnonzero(part).tolist() for part in found.split()] == [list(range(74)), list(range(75, 100))]
+    assert judge(found, None, at_once)['error_mm'] == pytest.approx(10)
+
+
+def test_hands_of_the_other_side_are_left_out_and_left_ones_are_mirrored():
+    camera, seen = Intrinsics(140, 140, 80, 60, 160, 120), _Crops()
+    joints, cube = np.full((21, 3), (0.1, 0.02, 0.5), np.float32), Cube((0.1, 0.02, 0.5), 0.3)
+    for side in ('left', 'right', 'none', 'left'):
+        hand = HandEstimate(joints + np.float32([0.03, 0, 0]), HAND21.joint_names, np.ones(21, np.float32), 1.0, side,
+                            cube, 'a')
+        image = SimpleNamespace(depth=np.full((120, 160), 0.5, np.float32), intrinsics=camera)
+        seen.add(image, [] if side == 'none' else [hand, hand])
+    rows, crops = seen.batch()
+    assert rows.tolist() == [0, 3]
+    np.testing.assert_allclose(crops['joints'][:, :, 0], -0.2, atol=1e-6)
+    np.testing.assert_allclose(crops['cube_center'], [(-0.1, 0.02, 0.5)] * 2, atol=1e-6)
+
+
+def test_images_that_are_no_label_are_left_out(monkeypatch):
+    count = 30
+    spread, joints = torch.full((count, 21), 0.004), torch.zeros(count, 21, 3)
+    spread[3], joints[20] = 0.02, 0.5  # of no agreement, and 75 mm beside where the hand is before and after
+    crops = {'patch': torch.zeros(count, 1, 128, 128), 'cube_center': torch.tensor([[0, 0, 0.5]]).expand(count, 3),
+             'cube_side': torch.full((count,), 0.3), 'number': torch.arange(count)}
+    monkeypatch.setattr(adapt, 'consensus', lambda *_: (joints, spread))
+    monkeypatch.setattr(adapt, 'fit_hand', lambda points, *_: points)
+    labelled = adapt.label(SimpleNamespace(run=None), torch.arange(count), crops, at_once)
+    assert labelled['number'].tolist() == [row for row in range(count) if row not in (3, 20)]
+
+
 def test_fine_tuning_learns_the_labels_and_leaves_the_original_alone(monkeypatch):
     monkeypatch.setattr(adapt, 'RATE', 1e-2)
     random = torch.Generator().manual_seed(0)
@@ -230,6 +268,9 @@ def test_fine_tuning_learns_the_labels_and_leaves_the_original_alone(monkeypatch
     assert all(torch.equal(value, before[name]) for name, value in tuned.state_dict().items() if 'running' in name)
     off = [(each(samples['patch']) - samples['joints']).norm(dim=-1).mean() for each in (network, tuned)]
     assert off[1] < 0.9 * off[0]
+    monkeypatch.setattr(adapt, 'WAY', 0.0)  # of the way to what was learned
+    still = fine_tune(network, samples, samples, 2, at_once).state_dict()
+    assert all(torch.equal(value, before[name]) for name, value in still.items())
 
 
 GOOD = {'found': 1.0, 'error_mm': None, 'disagreement_mm': 6.0, 'jitter_mm': 3.0, 'bone_drift_mm': 4.0,
@@ -246,3 +287,4 @@ def test_agreement_alone_is_not_better(change, better):
 def test_the_truth_decides_where_it_is_known():
     before, after = {**GOOD, 'error_mm': 12.0}, {**GOOD, 'error_mm': 12.5, 'disagreement_mm': 3.0, 'explained': 0.9}
     assert not is_better(before, after) and is_better(after, before)
+    assert not is_better(before, {**after, 'error_mm': 11.0, 'found': 0.98})  # by leaving out what is difficult

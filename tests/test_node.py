@@ -491,7 +491,7 @@ def test_camera_info_that_was_published_once_before_the_node_came_is_taken(rig: 
     infos = rig.client.create_publisher(CameraInfo, 'depth/camera_info', BEST_EFFORT)
     rig.connected(infos)
     infos.publish(camera_info(WIDTH // 2, HEIGHT // 2, FOCAL / 2))
-    assert rig.answer(publish, image(depth_with_hand()[::2, ::2])).hands
+    assert rig.answer(rig.camera(), image(depth_with_hand()[::2, ::2])).hands
     assert rig.transition('deactivate') and rig.transition('activate')
     rig.until(lambda: sum('listening to' in text for text in rig.said()) == 3, 'to hear all that was said before')
     assert not any('incompatible' in text for text in rig.said())

@@ -21,18 +21,18 @@ from hand_pose_ros.errors import HandPoseError
 
 VERBS = {
     'demo': 'play the bag that ships through the live node and show what comes out',
-    'estimate': 'joints and pictures from a bag or from 16-bit depth PNGs',
-    'estimator': 'the ROS 2 node',
-    'view': 'depth images and hands in 3D, live or from a bag',
+    'estimate': 'find the joints in a bag or in 16-bit depth PNGs',
+    'estimator': 'run the ROS 2 node',
+    'view': 'show depth images and hands in 3D, live or from a bag',
     'replay': 'publish a bag on ROS topics',
     'evaluate': 'score a prediction file, or the estimator on a bag',
-    'compare': 'several results side by side',
+    'compare': 'compare several results side by side',
     'train': 'train a network from a recipe',
     'adapt': 'fine-tune a network to your camera, from a bag without labels',
     'experiment': 'repeat an experiment of the paper',
     'synth': 'make or show synthetic depth hands',
     'bench': 'measure speed on this machine',
-    'doctor': 'what is installed, whether it works, and what to do where it does not',
+    'doctor': 'check what is installed and whether it works',
 }
 
 
@@ -98,7 +98,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv = list(sys.argv[1:] if argv is None else argv)
     parser = _Parser(
         prog='hand-pose', description='3D hand joints from depth images.',
-        epilog='hand-pose VERB --help says more about each verb.')
+        epilog='hand-pose VERB --help explains each verb.')
     parser.add_argument('--version', action='version', version=f'hand-pose {__version__}')
     subparsers = parser.add_subparsers(dest='verb', metavar='VERB', required=True)
     module = None

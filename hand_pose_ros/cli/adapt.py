@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from hand_pose_ros.training.adapt import Look, Numbers
 
 DESCRIPTION = ('Fine-tune a network to your camera, from a bag without labels, and compare it with the original '
-               'on images that it did not learn from. Needs no ROS and no GPU; takes some minutes.')
+               'on images that it did not learn from. It needs no ROS and no GPU, and takes some minutes.')
 
 EXAMPLES = """examples:
   hand-pose adapt my_hand.mcap --out my_camera.safetensors
@@ -42,12 +42,14 @@ ROWS = {'found': ('images with a hand, %', 100.0), 'error_mm': ('mean error, mm'
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the verb takes."""
-    parser.add_argument('bag', metavar='BAG', type=Path, help='one moving hand (ROS 1, sqlite3, MCAP)')
-    parser.add_argument('--out', type=Path, required=True, metavar='FILE', help='the new weights, .safetensors')
-    parser.add_argument('--model', help='weights to start from: a name or a checkpoint (the default weights)')
+    parser.add_argument('bag', metavar='BAG', type=Path, help='a recording of one moving hand (ROS 1, sqlite3, MCAP)')
+    parser.add_argument('--out', type=Path, required=True, metavar='FILE',
+                        help='write the new weights to this .safetensors')
+    parser.add_argument('--model', help='weights to start from: a name or a path (hand_dense)')
     parser.add_argument('--side', default='auto', choices=('auto', 'left', 'right'),
-                        help='which hand it is (auto); say it if you can')
-    parser.add_argument('--steps', type=count, default=300, metavar='N', help='of training, 32 samples each (300)')
+                        help='which hand it is (auto); give it if you can')
+    parser.add_argument('--steps', type=count, default=300, metavar='N',
+                        help='training steps, of 32 samples each (300)')
     parser.add_argument('--ground-truth', metavar='G', help='only for the comparison: a topic of the bag with '
                         'HandJointsArray, or an .npz file as for `hand-pose evaluate`')
     add_bag(parser)

@@ -83,10 +83,12 @@ def refuse(args: argparse.Namespace, names: Iterable[str], why: str) -> None:
 
 def add_bag(parser: Any) -> None:
     """How depth is read from a bag."""
-    parser.add_argument('--depth-topic', metavar='TOPIC', help='needed if several topics carry depth')
-    parser.add_argument('--camera-info-topic', metavar='TOPIC', help='if not camera_info beside the depth topic')
+    parser.add_argument('--depth-topic', metavar='TOPIC',
+                        help='topic of the depth images; needed if several topics carry depth')
+    parser.add_argument('--camera-info-topic', metavar='TOPIC',
+                        help='if it is not the camera_info beside the depth topic')
     parser.add_argument('--intrinsics', nargs=4, type=float, metavar=('FX', 'FY', 'CX', 'CY'),
-                        help='of the camera in pixels, instead of those of camera_info; PNGs have no others')
+                        help='of the camera, in pixels; replace those of camera_info, and are needed for PNGs')
     parser.add_argument('--depth-scale', type=metres, metavar='M', help='metres per unit of 16-bit depth (0.001)')
 
 
@@ -113,12 +115,13 @@ ESTIMATOR = ('model', 'device', 'side', 'detector', 'cube_size', 'min_score')
 
 def add_estimator(parser: Any) -> None:
     """How hands are estimated."""
-    parser.add_argument('--model', help='name of weights that ship, or a checkpoint (the default weights)')
+    parser.add_argument('--model', help='name of weights that ship, or path of a checkpoint (hand_dense)')
     parser.add_argument('--device', default='auto', help='auto, cpu, cuda or cuda:N (auto)')
     parser.add_argument('--side', default='auto', choices=('auto', 'left', 'right'), help='which hand it is (auto)')
     parser.add_argument('--detector', default='network', choices=('network', 'nearest'),
                         help='how hands are found: by a network, or as what is nearest to the camera (network)')
-    parser.add_argument('--cube-size', type=cube, metavar='M', help='side of the cube around a hand, metres')
+    parser.add_argument('--cube-size', type=cube, metavar='M',
+                        help='side of the cube around a hand, in metres (as the model was trained)')
     parser.add_argument('--min-score', type=share, metavar='S', help='leave out hands below this score (0.4)')
 
 

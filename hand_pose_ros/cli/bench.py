@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from hand_pose_ros.estimator import HandPoseEstimator
     from hand_pose_ros.runtime.engine import Pipeline
 
-DESCRIPTION = 'Measure how fast this machine runs networks, refinement, every stage and whole frames.'
+DESCRIPTION = 'Measure how fast this machine runs the networks, the refinement, every stage and whole frames.'
 
 EXAMPLES = """examples:
   hand-pose bench
@@ -26,7 +26,7 @@ EXAMPLES = """examples:
   hand-pose bench --model my.safetensors --quick
 
 Networks and frames are those of the weights that ship. All rows of a group run in turn, round by round, so that
-whatever else the machine does meets them alike. floor is the larger of two times, both measured in the same run: the
+other work on the machine affects them equally. floor is the larger of two times, both measured in the same run: the
 operations at the rate of a large matrix product, and the weights read once by a matrix-vector product. cpu_ms is the
 CPU time of a call in all threads; with --threads 1 it is what the call takes when nothing else runs.
 """
@@ -34,9 +34,9 @@ CPU time of a call in all threads; with --threads 1 it is what the call takes wh
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the verb takes."""
-    parser.add_argument('--json', type=Path, metavar='FILE', help='write the rows there too')
-    parser.add_argument('--model', help='whole frames with these weights, too, by name or path')
-    parser.add_argument('--threads', type=count, metavar='N', help='threads for the networks (chosen by the cores)')
+    parser.add_argument('--json', type=Path, metavar='FILE', help='also write the rows to this file')
+    parser.add_argument('--model', help='also measure whole frames with these weights (a name or a path)')
+    parser.add_argument('--threads', type=count, metavar='N', help='threads for the networks (by the number of cores)')
     parser.add_argument('--rounds', type=count, default=20, metavar='N',
                         help='rounds of 10 calls for each row (%(default)s)')
     parser.add_argument('--quick', action='store_true',

@@ -16,28 +16,30 @@ from hand_pose_ros.evaluation.published import DATASETS, load_result, named_apar
 from hand_pose_ros.evaluation.results import Result, told_notes
 from hand_pose_ros.files import write_json
 
-DESCRIPTION = 'Tables and curves of any number of results, and confidence intervals of their differences.'
+DESCRIPTION = 'Compare any number of results: tables, curves, and confidence intervals of their differences.'
 
 EXAMPLES = """examples:
   hand-pose compare a.npz b.npz --out plots
   hand-pose compare 'before=a.npz' 'after=b.npz' --json difference.json
   hand-pose compare DeepPrior.txt.gz DeepPrior-ORRef.txt.gz --ground-truth labels.txt.gz --dataset nyu --out plots
 
-The first result is the one that the others are compared with, frame by frame: a difference whose interval does not
-hold 0 is more than chance on these frames.
+The others are compared with the first result, frame by frame. If the interval of a difference does not contain 0, the
+difference on these frames is more than chance.
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the verb takes."""
     parser.add_argument('results', nargs='+', metavar='[NAME=]FILE',
-                        help='.npz of `hand-pose evaluate --out`, or predictions as text')
-    parser.add_argument('--ground-truth', metavar='G', help='labels of the predictions that are text')
-    parser.add_argument('--dataset', choices=sorted(DATASETS), help='joints and camera of predictions that are text')
-    parser.add_argument('--json', metavar='FILE', help='write all numbers there')
-    parser.add_argument('--out', metavar='FOLDER', help='write report.html, and curves and bars as PNG and SVG, there')
+                        help='an .npz of `hand-pose evaluate --out`, or a text file of predictions')
+    parser.add_argument('--ground-truth', metavar='G', help='labels for the results that are text files')
+    parser.add_argument('--dataset', choices=sorted(DATASETS),
+                        help='joints and camera of the results that are text files')
+    parser.add_argument('--json', metavar='FILE', help='write all numbers to this file')
+    parser.add_argument('--out', metavar='FOLDER',
+                        help='write report.html, and curves and bars as PNG and SVG, to this folder')
     parser.add_argument('--block', type=count, default=30, metavar='N',
-                        help='frames that are drawn together in the bootstrap, because they err alike (default: 30)')
+                        help='block size of the bootstrap: neighbouring frames have similar errors (default: 30)')
 
 
 def run(args: argparse.Namespace) -> int:

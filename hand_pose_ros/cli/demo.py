@@ -27,24 +27,26 @@ TRUTH_TOPIC = '/truth/joints'
 SHEET_PICTURES = 12
 ANIMATION_HEIGHT = 320
 
-DESCRIPTION = 'Play a bag through the real node in another process, and show what comes out.'
+DESCRIPTION = 'Play a bag through the real node, which runs in another process, and show what comes out.'
 
 EXAMPLES = """examples:
   hand-pose demo
   hand-pose demo --out /tmp/demo
   hand-pose demo --bag recording.mcap --model my_weights.safetensors
 
-It leaves sheet.png, animation.webp (any browser shows it) and summary.json in the folder. The exit code is 0 if every
+It writes sheet.png, animation.webp (any browser shows it) and summary.json to the folder. The exit code is 0 if every
 image was answered. The bag that ships shows a synthetic hand, as a simulated camera sees it.
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the verb takes."""
-    parser.add_argument('--out', type=Path, default=Path('demo_output'), metavar='FOLDER', help='(demo_output)')
-    parser.add_argument('--bag', type=Path, help='another bag than the one that ships; its truth, if it has any, is '
+    parser.add_argument('--out', type=Path, default=Path('demo_output'), metavar='FOLDER',
+                        help='where to write the results (demo_output)')
+    parser.add_argument('--bag', type=Path,
+                        help='play this bag instead of the one that ships; its ground truth, if any, is '
                         f'a HandJointsArray on {TRUTH_TOPIC}')
-    parser.add_argument('--model', default='', help='name of weights that ship, or a checkpoint (the default weights)')
+    parser.add_argument('--model', default='', help='name of weights that ship, or path of a checkpoint (hand_dense)')
 
 
 def run(args: argparse.Namespace) -> int:

@@ -20,7 +20,7 @@ from xml.etree import ElementTree
 from hand_pose_ros import __version__
 from hand_pose_ros.errors import HandPoseError
 
-DESCRIPTION = 'Say what is installed here, whether it works, and what to do where it does not.'
+DESCRIPTION = 'Check what is installed here and whether it works, and say what to do if it does not.'
 
 EXAMPLES = """examples:
   hand-pose doctor

@@ -40,7 +40,7 @@ from hand_pose_ros.skeleton import Skeleton
 if TYPE_CHECKING:
     from hand_pose_ros.estimator import HandPoseEstimator
 
-DESCRIPTION = 'The joints of every depth image of a bag or a folder, as numbers, as a bag and as pictures.'
+DESCRIPTION = 'Find the hand joints in every depth image of a bag or a folder; write numbers, a bag or pictures.'
 
 EXAMPLES = """examples:
   hand-pose estimate recording.mcap --out joints.npz --overlay pictures
@@ -62,8 +62,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_bag(parser)
     add_estimator(parser)
     parser.add_argument('--max-hands', type=count, default=2, metavar='N', help='at most N hands per image (2)')
-    parser.add_argument('--out', type=Path, metavar='FILE', help='.npz or .mcap')
-    parser.add_argument('--overlay', type=Path, metavar='FOLDER', help='a picture of every image with its joints')
+    parser.add_argument('--out', type=Path, metavar='FILE', help='write the joints to this .npz or .mcap file')
+    parser.add_argument('--overlay', type=Path, metavar='FOLDER',
+                        help='write a picture of every image with its joints there')
 
 
 def run(args: argparse.Namespace) -> int:

@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the verb takes."""
     parser.add_argument('--ros-args', nargs=argparse.REMAINDER, default=[], metavar='...',
                         help='remappings (-r from:=to) and parameters (-p name:=value), as for ros2 run')
-    parser.add_argument('--parameters', action='store_true', help='print the table of parameters and leave')
+    parser.add_argument('--parameters', action='store_true', help='print the table of parameters and exit')
 
 
 def run(args: argparse.Namespace) -> int:

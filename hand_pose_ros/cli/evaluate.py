@@ -35,8 +35,8 @@ from hand_pose_ros.files import write_json
 if TYPE_CHECKING:
     from hand_pose_ros.evaluation.bag_evaluation import Settings
 
-DESCRIPTION = ('Score predictions in a text file against labels, or run the estimator over bags and score it, or '
-               'only time it if there is no ground truth.')
+DESCRIPTION = ('Score predictions in a text file against labels, or run the estimator over bags and score it. Without '
+               'ground truth, report only what needs none, such as frame rate and jitter.')
 
 EXAMPLES = """examples:
   hand-pose evaluate --predictions NYU.txt.gz --ground-truth labels.txt.gz --dataset nyu --report out
@@ -47,8 +47,8 @@ EXAMPLES = """examples:
   hand-pose evaluate nyu --root /data/NYU --split test_2 --model runs/nyu/best.safetensors --json result.json
   torchrun --nproc-per-node 4 --no-python hand-pose evaluate bags/*.mcap --out results
 
-Text files have a frame a line, `u v d` for each joint: pixels and millimetres; gzipped or not, behind a file name
-or not.
+Text files have one frame per line, with `u v d` for each joint, in pixels and millimetres. A line may begin with a file
+name. The file may be gzipped.
 """
 
 
@@ -60,16 +60,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         'msra:P8 with --root')
     parser.add_argument('--ground-truth', metavar='G', help='text file of labels; with a bag also an .npz file with '
                         'joints (frames, joints, 3) in metres, or a topic of the bag with HandJointsArray')
-    parser.add_argument('--json', metavar='FILE', help='write all numbers there')
-    parser.add_argument('--report', metavar='FOLDER', help='write report.html and the plots there')
-    parser.add_argument('--out', metavar='FILE', help='write the result (.npz) there, for `hand-pose compare`; with '
+    parser.add_argument('--json', metavar='FILE', help='write all numbers to this file')
+    parser.add_argument('--report', metavar='FOLDER', help='write report.html and the plots to this folder')
+    parser.add_argument('--out', metavar='FILE', help='write the result to this .npz, for `hand-pose compare`; with '
                         'several bags a folder')
     parser.add_argument('--compare', nargs='+', default=[], metavar='[NAME=]FILE',
-                        help='other results for the report: .npz of --out, or text of the same dataset')
+                        help='more results for the report: an .npz of --out, or a text file of the same dataset')
     text = parser.add_argument_group('predictions as text')
     text.add_argument('--predictions', metavar='P', help='text file; or an .npz file with 2D joints `uv` of NYU, which '
                       'are lifted with --depth-folder')
-    text.add_argument('--dataset', choices=sorted(published.DATASETS), help='joints and camera')
+    text.add_argument('--dataset', choices=sorted(published.DATASETS), help='whose joints and camera the text has')
     text.add_argument('--depth-folder', metavar='FOLDER', help='depth_1_%%07d.png of NYU, for overlays and 2D joints')
     text.add_argument('--protocol', choices=('paper', 'code'), default='paper',
                       help='2D joints beside the hand get the depth of the back face of the cube (paper, the default), '
@@ -79,12 +79,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_estimator(bags)
     bags.add_argument('--out-bag', metavar='BAG', help='write /hand/joints and /hand/markers there, to be played '
                       'beside the original; with several bags a folder')
-    bags.add_argument('--via-ros', action='store_true', help='play the bag through the live node at its pace, and '
-                      'report the images it dropped and the latency from image to joints')
+    bags.add_argument('--via-ros', action='store_true',
+                      help='play the bag through the live node at the recorded rate, and '
+                      'report dropped images and the latency from image to joints')
     recorded = parser.add_argument_group('recorded datasets')
-    recorded.add_argument('--root', type=Path, metavar='FOLDER', help='of nyu, icvl or msra, as distributed')
-    recorded.add_argument('--split', help='test (the default), and of nyu and icvl test_1 and test_2; or val, train')
-    bags.add_argument('--jobs', type=count, metavar='N', help='bags at the same time (default: one per core)')
+    recorded.add_argument('--root', type=Path, metavar='FOLDER', help='folder of nyu, icvl or msra, as distributed')
+    recorded.add_argument('--split', help='test (the default), val or train; nyu and icvl also have test_1 and test_2')
+    bags.add_argument('--jobs', type=count, metavar='N',
+                      help='how many bags to process at the same time (default: one per core)')
 
 
 def run(args: argparse.Namespace) -> int:

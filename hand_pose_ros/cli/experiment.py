@@ -7,7 +7,7 @@ from pathlib import Path
 
 DESCRIPTION = """\
 Repeat an experiment of the paper: train the networks that it needs, test them, and write tables and plots.
-This may take hours; after Ctrl-C, the same command goes on."""
+This may take hours. After Ctrl-C, start the same command again to continue."""
 
 EXAMPLES = """experiments:
   networks      Shallow, Deep and Multi-Scale, each direct and with a bottleneck of 8 and 30, and DeepPrior++
@@ -19,7 +19,7 @@ EXAMPLES = """experiments:
   ingredients   (ours) what each ingredient of the synthetic hands is worth: trained without it, tested with all
 
 Each writes NAME.json, NAME.md, NAME.png and NAME.svg. Networks are trained with equal budgets into OUT/runs and shared
-by all experiments in OUT; an interrupted training goes on.
+by all experiments in OUT. An interrupted training continues.
 
 examples:
   hand-pose experiment bottleneck --out results --set samples=300_000
@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     parser.add_argument('name', choices=NAMES, metavar='NAME', help='see below')
     parser.add_argument('--out', type=Path, required=True, metavar='OUT', help='folder of results and trained networks')
-    parser.add_argument('--recipe', default='paper', help='what all networks are trained by (default: %(default)s)')
+    parser.add_argument('--recipe', default='paper', help='recipe of all networks (default: %(default)s)')
     add_machine_arguments(parser)
 
 

@@ -14,8 +14,8 @@ EXAMPLES = """examples:
   hand-pose replay recording.mcap --ros-args -r /camera/depth/image_rect_raw:=/depth/image_rect \\
                                              -r /camera/depth/camera_info:=/depth/camera_info
 
-While it plays, pause and go on with
-  ros2 service call /replay/pause std_srvs/srv/SetBool "{data: true}"     (or false)
+While it plays, pause (true) and continue (false) with
+  ros2 service call /replay/pause std_srvs/srv/SetBool "{data: true}"
 """
 _ENDLESS = 1e9
 """Beyond it nanoseconds do not fit into the times of messages."""
@@ -24,18 +24,20 @@ _ENDLESS = 1e9
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the verb takes."""
     parser.add_argument('bag', metavar='BAG', type=Path, help='a .bag, .mcap or .db3 file, or a ROS 2 folder')
-    parser.add_argument('--topics', nargs='+', metavar='TOPIC', help='publish these only')
-    parser.add_argument('--rate', type=float, default=1.0, metavar='X', help='times the recorded speed (1)')
-    parser.add_argument('--loop', action='store_true', help='begin again at the end, until Ctrl-C')
+    parser.add_argument('--topics', nargs='+', metavar='TOPIC', help='publish only these')
+    parser.add_argument('--rate', type=float, default=1.0, metavar='X', help='play X times as fast as recorded (1)')
+    parser.add_argument('--loop', action='store_true', help='start again at the end, until Ctrl-C')
     parser.add_argument('--start', type=float, default=0.0, metavar='S', help='begin S seconds into the bag (0)')
-    parser.add_argument('--start-paused', action='store_true', help='wait for the service /replay/pause')
+    parser.add_argument('--start-paused', action='store_true',
+                        help='start paused, until the service /replay/pause is called')
     parser.add_argument('--clock', action='store_true', help='publish /clock, for nodes with use_sim_time')
     parser.add_argument('--qos', default='recorded', choices=('recorded', 'reliable', 'best_effort'),
-                        help='reliability of the publishers (recorded; for ROS 1 bags that is reliable)')
+                        help='reliability of the publishers (recorded; ROS 1 bags: reliable)')
     parser.add_argument('--wait', type=float, default=4.0, metavar='S',
-                        help='seconds for subscribers to find the topics before the first message; they may need 3 (4)')
+                        help='seconds to wait before the first message, so that subscribers find the topics; they may '
+                             'need 3 (4)')
     parser.add_argument('--ros-args', nargs=argparse.REMAINDER, default=[], metavar='...',
-                        help='remappings (-r from:=to) and so on, as with ros2 run')
+                        help='remappings (-r from:=to) and other ROS arguments, as for ros2 run')
 
 
 def run(args: argparse.Namespace) -> int:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from hand_pose_ros.drawing import Picture
     from hand_pose_ros.synthetic.generator import SyntheticHands
 
-DESCRIPTION = 'Hands of many shapes in many poses, seen by simulated depth sensors, as networks are trained on.'
+DESCRIPTION = 'Make or show synthetic hands, seen by simulated depth sensors: the networks are trained on these.'
 
 EXAMPLES = """examples:
   hand-pose synth show hands.png --joints
@@ -36,38 +36,42 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the verb takes."""
     from hand_pose_ros.synthetic.sensors import SENSORS  # imports torch, as all that this verb does
     common = argparse.ArgumentParser(add_help=False)
-    common.add_argument('--split', default='train', choices=('train', 'val', 'test'), help='(train)')
+    common.add_argument('--split', default='train', choices=('train', 'val', 'test'),
+                        help='which hands, poses and seeds (train)')
     common.add_argument('--start', type=none_or_more, default=0, metavar='I', help='index of the first sample (0)')
     common.add_argument('--sensors', nargs='+', metavar='NAME',
-                        help=f'of {", ".join(sensor.name for sensor in SENSORS)} (all)')
+                        help=f'any of {", ".join(sensor.name for sensor in SENSORS)} (all)')
     common.add_argument('--rig', type=Path, metavar='GLB', help="another skin: a glTF hand with WebXR's joint names")
     real = argparse.ArgumentParser(add_help=False)
     real.add_argument('--real', nargs=6, action='append', default=[],
                       metavar=('FOLDER', 'FX', 'FY', 'CX', 'CY', 'SCALE'),
-                      help='16-bit depth PNGs, their camera in pixels and metres per unit; may be repeated')
+                      help='folder of 16-bit depth PNGs, intrinsics in pixels, metres per unit; may be repeated')
     actions = parser.add_subparsers(dest='action', metavar='show|write|record|stats', required=True)
 
     show = actions.add_parser('show', parents=[common, real],
-                              help='a contact sheet; left hands mirrored, as networks see them')
-    show.add_argument('out', type=Path, metavar='FILE', help='a PNG')
-    show.add_argument('--number', type=count, default=48, metavar='N', help='samples, or columns per sensor (48)')
-    show.add_argument('--joints', action='store_true', help='draw the joints; hidden ones hollow')
-    show.add_argument('--clean', action='store_true', help='as a perfect sensor would see them')
-    show.add_argument('--per-sensor', action='store_true', help='the same hands seen by each sensor, one a row')
+                              help='draw a contact sheet; left hands are mirrored, as networks see them')
+    show.add_argument('out', type=Path, metavar='FILE', help='the PNG to write')
+    show.add_argument('--number', type=count, default=48, metavar='N',
+                      help='number of samples, or of columns per sensor (48)')
+    show.add_argument('--joints', action='store_true', help='draw the joints; hidden ones are hollow')
+    show.add_argument('--clean', action='store_true', help='show them as a perfect sensor would see them')
+    show.add_argument('--per-sensor', action='store_true',
+                      help='show the same hands for each sensor, one sensor per row')
 
-    write = actions.add_parser('write', parents=[common], help='a dataset in .npz shards')
+    write = actions.add_parser('write', parents=[common], help='write a dataset in .npz shards')
     write.add_argument('out', type=Path, metavar='FOLDER')
-    write.add_argument('--number', type=count, required=True, metavar='N', help='samples')
+    write.add_argument('--number', type=count, required=True, metavar='N', help='number of samples')
     write.add_argument('--shard', type=count, default=4096, metavar='N', help='samples per file (4096)')
     write.add_argument('--device', default='cpu', help='cpu, cuda or cuda:N (cpu)')
 
-    record = actions.add_parser('record', parents=[common], help='a bag of one moving hand, with its true joints')
+    record = actions.add_parser('record', parents=[common], help='write a bag of one moving hand, with its true joints')
     record.add_argument('out', type=Path, metavar='BAG', help='a .mcap or .db3 file, or the folder of a ROS 2 bag')
-    record.add_argument('--number', type=count, default=90, metavar='N', help='images, 30 a second (90)')
-    record.add_argument('--raw', action='store_true', help='depth as sensor_msgs/Image instead of compressedDepth')
+    record.add_argument('--number', type=count, default=90, metavar='N', help='number of images, 30 per second (90)')
+    record.add_argument('--raw', action='store_true',
+                        help='write depth as sensor_msgs/Image instead of compressedDepth')
 
-    stats = actions.add_parser('stats', parents=[common, real], help='numbers of synthetic beside real crops')
-    stats.add_argument('--number', type=count, default=512, metavar='N', help='synthetic samples (512)')
+    stats = actions.add_parser('stats', parents=[common, real], help='compare statistics of synthetic and real crops')
+    stats.add_argument('--number', type=count, default=512, metavar='N', help='number of synthetic samples (512)')
 
 
 def run(args: argparse.Namespace) -> int:

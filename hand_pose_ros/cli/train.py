@@ -10,8 +10,8 @@ from hand_pose_ros.cli.arguments import count, none_or_more
 from hand_pose_ros.files import check_writable
 
 DESCRIPTION = """\
-Train a network from a recipe, on synthetic hands or a recorded dataset. This may take hours: Ctrl-C stops
-after the current step and leaves weights to use, and --resume goes on from there."""
+Train a network from a recipe, on synthetic hands or a recorded dataset. This may take hours. Ctrl-C stops
+after the current step and leaves weights that you can use; --resume continues from there."""
 
 EXAMPLES = """examples:
   hand-pose train modern --out runs/modern
@@ -29,7 +29,7 @@ recipes: paper, original-code, modern, finder. docs/training.md says what they d
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the verb takes."""
     parser.add_argument('recipe', nargs='?',
-                        help='paper, original-code, modern or finder (with --resume: that of the run)')
+                        help='paper, original-code, modern or finder (with --resume: the recipe of the run)')
     parser.add_argument('--out', type=Path, required=True, metavar='RUN', help='folder of the run')
     parser.add_argument('--resume', action='store_true', help='continue the run in RUN')
     add_machine_arguments(parser)
@@ -41,12 +41,14 @@ def add_machine_arguments(parser: argparse.ArgumentParser) -> None:
                         help='replace a value of the recipe; may be given several times')
     parser.add_argument('--device', default='cpu', help='cpu or cuda (default: %(default)s)')
     parser.add_argument('--workers', type=none_or_more, default=1,
-                        help='processes that render or decode; 0: on the device, for a GPU (default: %(default)s)')
+                        help='processes that render or decode; 0: render on the device, for a GPU (default: '
+                             '%(default)s)')
     parser.add_argument('--threads', type=count, help='threads of the training process (default: all cores)')
     parser.add_argument('--cache', type=Path, default=Path('~/.cache/hand_pose_ros/samples').expanduser(),
                         help='where rendered and decoded samples are kept for all runs (default: %(default)s)')
     parser.add_argument('--cache-gb', type=count, default=40,
-                        help='delete the samples used longest ago beyond this size (default: %(default)s)')
+                        help='GB of the cache; beyond it, the samples used longest ago are deleted (default: '
+                             '%(default)s)')
 
 
 def machine(args: argparse.Namespace) -> Any:

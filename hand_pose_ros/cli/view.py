@@ -50,16 +50,16 @@ Without a bag it shows what a camera and the node `estimator` publish, until Ctr
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the verb takes."""
     parser.add_argument('bag', metavar='BAG', type=Path, nargs='?', help='a .bag, .mcap or .db3 file, or a ROS 2 '
-                        'folder: its hands are estimated; without it, live topics are shown')
+                        'folder: its hands are estimated and shown; without it, live topics are shown')
     parser.add_argument('--save', metavar='FILE', type=Path, help='write an .rrd file instead of opening the viewer')
-    bag = parser.add_argument_group('with a bag (live, --intrinsics and --depth-scale alone)')
+    bag = parser.add_argument_group('with a bag (live, only --intrinsics and --depth-scale apply)')
     add_bag(bag)
     add_estimator(bag)
     bag.add_argument('--max-hands', type=count, default=2, metavar='N', help='at most N hands per image (2)')
     live = parser.add_argument_group('live')
-    live.add_argument('--transport', default='raw', choices=TRANSPORTS, help='of the depth images (raw)')
+    live.add_argument('--transport', default='raw', choices=TRANSPORTS, help='how the depth images arrive (raw)')
     live.add_argument('--ros-args', nargs=argparse.REMAINDER, default=[], metavar='...',
-                      help='remappings (-r from:=to) and so on, as with ros2 run')
+                      help='remappings (-r from:=to) and other ROS arguments, as for ros2 run')
 
 
 def run(args: argparse.Namespace) -> int:

@@ -29,8 +29,8 @@ def test_a_gpu_without_enough_memory_is_told(arguments, remedy, monkeypatch, tmp
     def full(device):
         raise torch.cuda.OutOfMemoryError('CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has 1 GiB.')
     monkeypatch.chdir(tmp_path)
-    for where in ('hand_pose_ros.runtime', 'hand_pose_ros.training.loop'):
-        monkeypatch.setattr(f'{where}.check_device', full)
+    for where in ('training.loop', 'training.distributed', 'runtime'):  # whose function the others import, so last
+        monkeypatch.setattr(f'hand_pose_ros.{where}.check_device', full)
     assert main([*arguments, '--device', 'cuda']) == 1
     said = capsys.readouterr().err
     assert said.startswith(f'hand-pose {arguments[0]}: CUDA out of memory: end what else uses the GPU')

@@ -15,7 +15,8 @@ from hand_pose_ros.estimator import HandPoseEstimator
 def main() -> None:
     estimator = HandPoseEstimator.from_pretrained(max_hands=2)
     table = csv.writer(sys.stdout)
-    with DepthBag(sys.argv[1]) as bag:  # DepthBag(path, depth_topic=..., intrinsics=(fx, fy, cx, cy)) if it must choose
+    # With several depth topics, or without camera_info: DepthBag(path, depth_topic=..., intrinsics=(fx, fy, cx, cy))
+    with DepthBag(sys.argv[1]) as bag:
         table.writerow(['stamp_ns', 'frame_id', 'hand', 'side', 'joint', 'x_m', 'y_m', 'z_m', 'confidence'])
         for frame in bag:
             for hand in estimator(frame.depth, frame.intrinsics, time_s=frame.stamp_ns / 1e9):

@@ -24,7 +24,7 @@ def main() -> None:
     parser.add_argument('--picture', help='draw the joints there')
     args = parser.parse_args()
 
-    depth = read_png(args.png, args.depth_scale)  # (H, W) float32 metres, 0 = no reading
+    depth = read_png(args.png, args.depth_scale)  # (H, W) float32, metres, 0 = no reading
     intrinsics = Intrinsics(*args.intrinsics, width=depth.shape[1], height=depth.shape[0])
     hands = HandPoseEstimator.from_pretrained()(depth, intrinsics)
     for hand in hands:

@@ -1,11 +1,12 @@
 #!/usr/bin/env python3
-"""Open and close a gripper as the hand opens and closes: finger angles to the command of a ros2_control gripper.
+"""Open and close a ros2_control gripper as the hand opens and closes. The command follows from the finger angles.
 
     python examples/gripper.py --ros-args -r gripper/commands:=/gripper_controller/commands -p max_opening:=0.08
 
-It listens to the node: start that first, as for examples/subscribe.py. The command is the opening in metres, as a
-forward_command_controller takes it. Of several hands it follows one until that is gone, and then the likeliest. Without
-a hand that can be trusted the gripper stays as it is. It is taken to be open at the start: open it before.
+Start the node first, as for examples/subscribe.py: this script listens to it. The command is the opening in metres, as
+a forward_command_controller expects it. If there are several hands, the script follows one of them until it is gone,
+and then the one with the highest score. Without a hand that it can trust, the gripper does not move. The script assumes
+that the gripper is open at the start: open it first.
 """
 
 import numpy as np
@@ -21,14 +22,14 @@ from hand_pose_ros.skeleton import HAND21
 SIDES = {HandJoints.LEFT: 'left', HandJoints.RIGHT: 'right'}
 PIP = [ANGLES.index(f'{finger}_pip_flexion') for finger in ('index', 'middle', 'ring', 'pinky')]
 FIST_RAD = 1.4
-"""The middle joint of a finger in a fist is bent by at least this much."""
+"""In a fist, the middle joint of a finger is bent by at least this angle."""
 MIN_SCORE = 0.5
 SPEED = 0.2
-"""Metres per second at most: one wrong estimate must not slam the gripper."""
+"""Maximum speed in metres per second. One wrong estimate must not slam the gripper."""
 
 
 def closing(joints: np.ndarray, side: str) -> float:
-    """Joints hand21 (21, 3) -> 0 for an open hand, 1 for a fist; the median finger decides."""
+    """Joints of hand21 (21, 3) -> 0 for an open hand, 1 for a fist. The median of the fingers counts."""
     return float(np.clip(np.median(finger_angles(joints, side)[PIP]) / FIST_RAD, 0, 1))
 
 
@@ -46,7 +47,7 @@ class Gripper(Node):
             self.get_logger().error(f"hand/joints has the joints of '{message.skeleton}': start the node with a model "
                                     'of hand21, such as the default', once=True)
             return
-        # Scores of two hands are nearly the same: by them alone, it would follow now one, now the other.
+        # Two hands have nearly the same score. With the score alone, the gripper would switch between them.
         hand = max(message.hands, key=lambda hand: (hand.id == self.followed, hand.score), default=None)
         if hand is None or hand.score < MIN_SCORE or hand.side not in SIDES:
             return
@@ -54,7 +55,7 @@ class Gripper(Node):
         joints = np.array([(point.x, point.y, point.z) for point in hand.joints])
         wanted = self.max_opening * (1 - closing(joints, SIDES[hand.side]))
         now = self.get_clock().now()
-        # Clocks jump: back when a bag begins again, and far ahead after a pause.
+        # Clocks jump: back when a bag starts again, and far ahead after a pause.
         reach = SPEED * np.clip((now - self.moved).nanoseconds / 1e9, 0, 0.1)
         step = np.clip(wanted - self.opening, -reach, reach)
         self.opening = float(np.clip(self.opening + step, 0, self.max_opening))

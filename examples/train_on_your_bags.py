@@ -5,9 +5,9 @@
         --set augmentation=modern --set samples=500_000
     hand-pose estimate thursday.mcap --model my_network/run/best.safetensors --overlay pictures
 
-Record other people and other poses for --val than for --train. The labels are what the network that ships is sure of,
-so the new network cannot be more accurate than that one: it can only be faster, or used to your camera. If you have
-better labels (markers, a glove), write them with BagWriter.write_hands instead, and leave out `label`.
+For --val, record other people and other poses than for --train. The labels are the hands of which the network that
+ships is sure. So the new network cannot be more accurate than that one. It can only be faster, or better adapted to
+your camera. If you have better labels (markers, a glove), write them with BagWriter.write_hands, and leave out `label`.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from hand_pose_ros.estimator import HandPoseEstimator
 
 
 def label(bag: Path, out: Path, estimator: HandPoseEstimator, min_score: float) -> int:
-    """Copy the images of a bag in which a hand was found, with its joints; returns how many."""
+    """Copy the images in which a hand is found, and its joints, into a new bag. Returns the number of images."""
     estimator.reset()
     count = 0
     with DepthBag(bag) as source, BagWriter(out) as labelled:

@@ -1,21 +1,23 @@
-"""Angles of the finger joints from the positions of the hand21 joints, e.g. to drive a robot hand.
+"""Angles of the finger joints from the positions of the hand21 joints, for example to drive a robot hand.
 
-The palm gives the frame: y from the wrist to the knuckle of the middle finger, x from the knuckle of the ring finger
-towards that of the index finger, z out of the palm. (The little finger's knuckle is left out: its metacarpal moves.)
+The palm defines the frame: y from the wrist to the knuckle of the middle finger, x from the knuckle of the ring finger
+towards that of the index finger, z out of the palm. (The knuckle of the little finger is not used: its metacarpal
+moves.)
 
-Names as in anatomy; all 0 when a finger is straight and parallel to the middle metacarpal:
+The names are those of anatomy. All angles of a finger are 0 when it is straight and parallel to the middle metacarpal:
 
-- `<finger>_mcp_flexion`: of the first bone towards the palm; negative is hyperextension.
-- `<finger>_mcp_abduction`: of the first bone out of the sagittal plane, away from the middle finger; of the middle
-  finger itself, towards the thumb. Fingers that lie side by side differ by a few degrees, as they converge.
-- `<finger>_pip_flexion`, `<finger>_dip_flexion`: of the next two bones, each against the one before.
-- `thumb_cmc_flexion`: of the thumb's metacarpal across the palm, in its plane; spread away from the hand is negative.
-- `thumb_cmc_abduction`: of the thumb's metacarpal out of that plane (palmar abduction).
+- `<finger>_mcp_flexion`: the first bone towards the palm; hyperextension is negative.
+- `<finger>_mcp_abduction`: the first bone out of the sagittal plane, away from the middle finger; for the middle finger
+  itself, towards the thumb. Fingers that lie side by side differ by a few degrees, because they converge.
+- `<finger>_pip_flexion`, `<finger>_dip_flexion`: the next two bones, each relative to the bone before it.
+- `thumb_cmc_flexion`: the metacarpal of the thumb across the palm, in the plane of the palm; spread away from the hand
+  is negative.
+- `thumb_cmc_abduction`: the metacarpal of the thumb out of that plane (palmar abduction).
 - `thumb_mcp_flexion`, `thumb_ip_flexion`: the whole bend of the joint, positive towards the root of the little finger,
-  negative away from it. A bend that is nearly sideways, as of an MCP that is abducted, counts less the nearer it is to
-  that, so that the angle passes through 0 and does not jump.
+  negative away from it. The nearer a bend is to sideways, for example of an abducted MCP, the less it counts. So the
+  angle passes through 0 and does not jump.
 
-Rotation about the axis of a bone leaves no trace in the positions: it is not given.
+The rotation about the axis of a bone cannot be seen in the positions, so there is no angle for it.
 """
 
 from __future__ import annotations
@@ -33,26 +35,26 @@ ANGLES = ('thumb_cmc_flexion', 'thumb_cmc_abduction', 'thumb_mcp_flexion', 'thum
 
 _JOINT = {name: i for i, name in enumerate(HAND21.joint_names)}
 _ABDUCTING = {'index': 1, 'middle': 1, 'ring': -1, 'pinky': -1}
-"""Sign of x in the direction that abducts."""
+"""Sign of x in the direction of abduction."""
 _BELOW = 0.2
-"""Of the palm's length: the thumb flexes towards what is so far below the little finger's knuckle. Of 8,192 poses of
-`synthetic.poses.sample_poses` 52 of 6,706 bends of its MCP by more than 5 degrees have the wrong sign then, and none of
-7,196 of its IP; towards the knuckle itself 78 and 4."""
+"""The thumb flexes towards a point below the knuckle of the little finger, by this share of the palm's length. In 8,192
+poses of `synthetic.poses.sample_poses`, counting bends by more than 5 degrees, 52 of 6,706 bends of the MCP then have
+the wrong sign, and none of 7,196 of the IP. With the knuckle itself as the target, these are 78 and 4."""
 _SIDEWAYS = 0.5
-"""Cosine between the direction of a bend and that of flexion, from which the whole bend counts."""
+"""From this cosine on, between the direction of a bend and the direction of flexion, the whole bend counts."""
 
 
 def finger_angles(joints: ArrayLike, side: str) -> NDArray[np.float64]:
     """The ANGLES of hands (..., 20), in radians.
 
-    Where bones have no length, and so no direction, angles are 0.
+    Where a bone has no length, and so no direction, angles are 0.
 
     Args:
-        joints: (..., 21, 3) hand21, in any right-handed frame and any unit.
+        joints: (..., 21, 3) joints of hand21, in any right-handed frame and any unit.
         side: 'left' or 'right'.
 
     Raises:
-        InputError: another side, or another number of joints.
+        InputError: the side is another one, or the joints have another shape.
     """
     points = np.asarray(joints, np.float64)
     if side not in ('left', 'right'):
@@ -79,7 +81,7 @@ def finger_angles(joints: ArrayLike, side: str) -> NDArray[np.float64]:
 
 
 def _thumb(bones: NDArray[np.float64], towards: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Angles of the thumb (..., 3 bones, 3); flexion is `towards`, a direction in the frame of the palm."""
+    """Angles of the thumb (..., 3 bones, 3). It flexes `towards` this direction in the frame of the palm."""
     metacarpal = bones[..., 0, :]
     bends = []
     for before, after in ((metacarpal, bones[..., 1, :]), (bones[..., 1, :], bones[..., 2, :])):
@@ -90,17 +92,17 @@ def _thumb(bones: NDArray[np.float64], towards: NDArray[np.float64]) -> list[NDA
 
 
 def _finger(bones: NDArray[np.float64], abducting: int) -> list[NDArray[np.float64]]:
-    """Angles of a finger (..., 3 bones, 3): a saddle joint that flexes about x and then turns about z, two hinges."""
+    """Angles of a finger (..., 3 bones, 3): a saddle joint (flexion about x, then a turn about z), and two hinges."""
     first = bones[..., 0, :]
     flexion = np.arctan2(first[..., 2], first[..., 1])
     abduction = np.arcsin(np.clip(first[..., 0], -1, 1))
-    # What the hinges bend towards: the direction that flexion gives the palmar side of the first bone.
+    # The hinges bend in this direction: the palmar side of the first bone, after its flexion.
     palmar = np.stack([np.zeros_like(flexion), -np.sin(flexion), np.cos(flexion)], -1)
     pip = np.arctan2(_dot(bones[..., 1, :], palmar), _dot(bones[..., 1, :], first))
     along = np.cos(pip)[..., None] * first + np.sin(pip)[..., None] * palmar
     palmar = np.cos(pip)[..., None] * palmar - np.sin(pip)[..., None] * first
     dip = np.arctan2(_dot(bones[..., 2, :], palmar), _dot(bones[..., 2, :], along))
-    # A hinge behind a bone that has no direction does not bend against it.
+    # A hinge cannot bend relative to a bone without direction.
     there = np.any(bones != 0, axis=-1)
     return [flexion, abducting * abduction, pip * there[..., 0], dip * there[..., :2].all(-1)]
 

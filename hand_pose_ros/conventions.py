@@ -1,17 +1,17 @@
-"""Conventions of ROS that hold with and without it: transports of images, where their camera_info is, and stamps."""
+"""Conventions of ROS that this package also needs without ROS: image transports, camera_info topics, and stamps."""
 
 from __future__ import annotations
 
 from typing import Any
 
 TRANSPORTS = ('raw', 'compressedDepth', 'compressed')
-"""The better one first. All but raw have a topic below that of the image (image_transport)."""
+"""The better transports first. All but raw have a topic below that of the image (image_transport)."""
 CROP = 'debug/crop'
-"""Below the name of the node: what the network sees, which has the encoding of depth and is none."""
+"""The topic, below the name of the node, of what the network sees. It has an encoding of depth, but is not depth."""
 
 
 def split_transport(topic: str) -> tuple[str, str]:
-    """The topic of the image and the transport: /depth/image/compressedDepth -> /depth/image, compressedDepth."""
+    """The topic of the image, and the transport: /depth/image/compressedDepth -> /depth/image, compressedDepth."""
     image, _, last = topic.rpartition('/')
     return (image, last) if last in TRANSPORTS[1:] else (topic, 'raw')
 
@@ -22,7 +22,7 @@ def join_transport(image_topic: str, transport: str) -> str:
 
 
 def camera_info_beside(image_topic: str) -> str:
-    """Where the camera_info of an image is looked for: /depth/image -> /depth/camera_info."""
+    """The topic where the camera_info of an image is expected: /depth/image -> /depth/camera_info."""
     return f'{image_topic.rpartition("/")[0]}/camera_info'
 
 

@@ -1,8 +1,12 @@
 """Bytes of a depth image -> depth in metres, float32, where 0 means "no reading".
 
-Understood are the encodings 16UC1, mono16 and 32FC1 (REP-118) of sensor_msgs/Image, the transports
-`compressedDepth` (PNG and RVL) and plain `compressed` (16-bit PNG, TIFF) of sensor_msgs/CompressedImage, and 16-bit
-PNG files. Messages are taken by their fields: those of rclpy, of a bag reader, or any object with the same attributes.
+Supported inputs:
+
+- sensor_msgs/Image with the encodings 16UC1, mono16 and 32FC1 (REP-118)
+- sensor_msgs/CompressedImage with the transports `compressedDepth` (PNG and RVL) and `compressed` (16-bit PNG, TIFF)
+- 16-bit PNG files
+
+A message may come from rclpy or from a bag reader, or be any object with the same attributes.
 """
 
 from __future__ import annotations
@@ -19,13 +23,14 @@ from hand_pose_ros.errors import InputError, naming
 
 DEPTH_ENCODINGS: dict[str, np.dtype[Any]] = {
     '16UC1': np.dtype('u2'), 'mono16': np.dtype('u2'), '32FC1': np.dtype('f4')}
-"""The encodings that hold depth, and the type of one pixel."""
+"""The encodings that hold depth, and the type of their pixels."""
 
 MAX_PIXELS, MAX_SIDE = 1 << 24, 1 << 13
-"""Far above any depth camera: an image that claims more is corrupt and gets neither memory nor, long and thin, time."""
+"""Far above any depth camera. An image that claims more is corrupt. It must not use up memory or, if it is long and
+thin, time."""
 
 MAX_OUTSIDE = 0.99
-"""With more of the readings out of range, the unit of depth is likely wrong."""
+"""If more than this share of the readings is out of range, the unit of depth is probably wrong."""
 
 _PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
 _HEADER = struct.Struct('<iff')  # compressedDepth: kind of quantisation and its parameters A and B
@@ -33,16 +38,16 @@ _SMALLEST, _LARGEST = float(np.finfo(np.float32).tiny), float(np.finfo(np.float3
 
 
 def decode_image(msg: Any, depth_scale: float = 0.001, *, source: str = '') -> NDArray[np.float32]:
-    """Depth (H, W) in metres of a sensor_msgs/Image; 0 = no reading, also for NaN, Inf and negative (REP-117).
+    """Depth (H, W) in metres of a sensor_msgs/Image. 0 = no reading; so are NaN, Inf and negative values (REP-117).
 
     Args:
-        msg: `height`, `width`, `step`, `encoding` (see DEPTH_ENCODINGS), `is_bigendian`, `data` (any buffer).
-        depth_scale: metres per unit of the 16-bit encodings; 32FC1 is in metres already.
+        msg: has `height`, `width`, `step`, `encoding` (see DEPTH_ENCODINGS), `is_bigendian`, `data` (any buffer).
+        depth_scale: metres per unit of the 16-bit encodings. 32FC1 is always in metres.
         source: the topic or file, to begin error messages with.
 
     Raises:
-        InputError: not a depth encoding, an image that is empty or larger than any, rows shorter than the width, or
-            less data than rows.
+        InputError: the encoding is not depth, the image is empty or impossibly large, a row is shorter than the width,
+            there is less data than the rows need, or depth_scale is not positive.
     """
     with naming(source):
         height, width, step = int(msg.height), int(msg.width), int(msg.step)
@@ -68,14 +73,15 @@ def decode_compressed(msg: Any, depth_scale: float = 0.001, *, source: str = '')
     """Depth (H, W) in metres of a sensor_msgs/CompressedImage; 0 = no reading.
 
     Args:
-        msg: `format` and `data` (any buffer). Formats: `16UC1; compressedDepth png`, `... rvl`, without the
-            codec (png), with nothing after the encoding (png), and `16UC1; png compressed` and `...; tiff compressed`
-            of the plain `compressed` transport; 32FC1 is inverse depth, quantised to 16 bits, but metres in TIFF.
+        msg: has `format` and `data` (any buffer). Formats of the transport compressedDepth: `16UC1; compressedDepth
+            png` and `... rvl`; without a codec, or with nothing after the encoding, the codec is png. Formats of the
+            transport compressed: `16UC1; png compressed` and `...; tiff compressed`. 32FC1 is inverse depth, quantised
+            to 16 bits, except in TIFF, where it is metres.
         depth_scale: metres per unit of the 16-bit encodings.
         source: the topic or file, to begin error messages with.
 
     Raises:
-        InputError: another format, or data that is corrupt.
+        InputError: the format is another one, the data is corrupt, or depth_scale is not positive.
     """
     with naming(source):
         words = msg.format.replace(';', ' ').split()
@@ -99,14 +105,14 @@ def decode_compressed(msg: Any, depth_scale: float = 0.001, *, source: str = '')
 
 def encode_compressed(
         depth: NDArray[np.float32], codec: str = 'png', depth_scale: float = 0.001) -> tuple[str, bytes]:
-    """`format` and `data` of a 16UC1 sensor_msgs/CompressedImage on a `.../compressedDepth` topic.
+    """`format` and `data` of a 16UC1 sensor_msgs/CompressedImage, for a `.../compressedDepth` topic.
 
     Args:
-        depth: (H, W) in metres, 0 = no reading; see `to_units` for what 16 bits can hold.
+        depth: (H, W) in metres, 0 = no reading. See `to_units` for what 16 bits can hold.
         codec: 'png' (smaller) or 'rvl' (faster to decode in C++ players).
 
     Raises:
-        InputError: another codec, or a depth_scale that is none.
+        InputError: the codec is another one, or depth_scale is not positive.
     """
     if codec not in ('png', 'rvl'):
         raise InputError(f"unknown codec '{codec}': choose png or rvl")
@@ -119,7 +125,8 @@ def read_png(path: str | Path, depth_scale: float = 0.001) -> NDArray[np.float32
     """Depth (H, W) in metres of a 16-bit greyscale PNG file; 0 = no reading.
 
     Raises:
-        InputError: the file cannot be read, is not a PNG, is damaged, or has not 16 bits in one channel.
+        InputError: the file cannot be read, is not a PNG, is damaged, or does not have one channel of 16 bits; or
+            depth_scale is not positive.
     """
     with naming(str(path)):
         try:
@@ -130,10 +137,11 @@ def read_png(path: str | Path, depth_scale: float = 0.001) -> NDArray[np.float32
 
 
 def depth_problem(depth: NDArray[np.float32], near: float, far: float, scale_is_right: bool = False) -> str:
-    """What may be wrong with a depth image (H, W) [m] in which there was no hand; empty when it looks sane.
+    """What may be wrong with a depth image (H, W) [m] in which no hand was found. Empty if the image looks sane.
 
     Args:
-        scale_is_right: a hand was seen at this scale, so that what is out of range is only far away.
+        near, far: range in which hands are looked for, metres.
+        scale_is_right: a hand was seen at this depth_scale before. So readings out of range are only far away.
     """
     sample = depth[::8, ::8]
     readings = sample[sample > 0]
@@ -154,7 +162,7 @@ def to_metres(units: NDArray[np.uint16], depth_scale: float = 0.001) -> NDArray[
 
 
 def to_units(depth: NDArray[np.float32], depth_scale: float = 0.001) -> NDArray[np.uint16]:
-    """Metres (H, W) -> the nearest sensor unit; what does not fit into 16 bits becomes 0, "no reading"."""
+    """Metres (H, W) -> the nearest sensor units. A value that does not fit into 16 bits becomes 0, "no reading"."""
     _check_scale(depth_scale)
     units = np.rint(np.asarray(depth, np.float64) / depth_scale)
     return np.where((units > 0) & (units <= 0xFFFF), units, 0).astype(np.uint16)
@@ -162,20 +170,21 @@ def to_units(depth: NDArray[np.float32], depth_scale: float = 0.001) -> NDArray[
 
 def encode_png(units: NDArray[np.uint16]) -> bytes:
     """Sensor units (H, W) -> a 16-bit greyscale PNG."""
-    native = np.asarray(units, np.uint16)  # OpenCV takes any order of bytes for that of this machine
+    native = np.asarray(units, np.uint16)  # OpenCV assumes the byte order of this machine
     return cv2.imencode('.png', native)[1].tobytes()
 
 
 def encode_rvl(units: NDArray[np.uint16]) -> bytes:
-    """Sensor units (H, W) -> RVL (Wilson 2017), behind the width and height as compressedDepth has it.
+    """Sensor units (H, W) -> RVL (Wilson 2017), after the width and the height, as in compressedDepth.
 
-    The stream is runs of {how many zeros, how many others, the differences of the others}; each of these numbers
-    is cut into groups of 3 bits, low ones first, and each group is a nibble whose bit 8 says that more follow.
+    The stream consists of runs. A run is the number of zeros, the number of other values, and the differences between
+    these values. Each of these numbers is split into groups of 3 bits, the low bits first. Each group is a nibble; its
+    highest bit (8) says that another group of the same number follows.
     """
     flat = np.asarray(units, np.int64).ravel()
     changes = np.flatnonzero(np.diff(flat != 0, prepend=False)) if flat.size else np.empty(0, np.int64)
     edges = np.concatenate([[0], changes, [flat.size] * (1 + (len(changes) % 2 == 0))])
-    lengths = np.diff(edges).reshape(-1, 2)  # a row for every run: zeros, others
+    lengths = np.diff(edges).reshape(-1, 2)  # one row for each run: zeros, other values
     values = flat[flat != 0]
     delta = np.diff(values, prepend=0)
     numbers = np.insert((delta << 1) ^ (delta >> 63),
@@ -216,7 +225,7 @@ def decode_rvl(data: bytes | memoryview) -> NDArray[np.uint16]:
     position = np.arange(len(nibbles)) - np.repeat(ends - groups + 1, groups)
     numbers = np.add.reduceat((nibbles & 7).astype(np.int64) << 3 * position, ends - groups + 1)
 
-    # Where a run ends is only known when it is reached; all else is done at once.
+    # The end of a run is only known when it is reached, so this needs a loop. All else is done at once.
     heads: list[int] = []
     lengths: list[int] = []
     at = filled = 0
@@ -242,12 +251,12 @@ def decode_rvl(data: bytes | memoryview) -> NDArray[np.uint16]:
 
 
 def _decode_units(payload: memoryview, words: list[str]) -> NDArray[np.uint16]:
-    """The 16-bit image that a compressed message carries; the words of its format tell the codec."""
+    """The 16-bit image in a compressed message. The words of its format say which codec it has."""
     return decode_rvl(payload) if 'rvl' in words else _decode_png(payload)
 
 
 def _decode_png(data: memoryview) -> NDArray[np.uint16]:
-    """(H, W) sensor units; the header is checked first, so that a corrupt one cannot claim memory."""
+    """(H, W) sensor units. The header is checked first, so that a corrupt one cannot use up memory."""
     if len(data) < 26 or bytes(data[:8]) != _PNG_SIGNATURE or bytes(data[12:16]) != b'IHDR':
         raise InputError('the data is not a PNG: the file or message was cut short or is of another format')
     width, height, bits, color = struct.unpack_from('>IIBB', data, 16)
@@ -256,14 +265,14 @@ def _decode_png(data: memoryview) -> NDArray[np.uint16]:
                          'metric depth: record 16-bit greyscale (one channel)')
     _check_size(width, height)
     end, kind = 8, b''
-    while end + 8 <= len(data) and kind != b'IEND':  # OpenCV makes room for a chunk of whatever length it claims
+    while end + 8 <= len(data) and kind != b'IEND':  # OpenCV allocates whatever length a chunk claims
         length, kind = struct.unpack_from('>I4s', data, end)
         end += length + 12
     return _imdecode(data if end <= len(data) else data[:0], 'PNG', (height, width), np.dtype('u2'))
 
 
 def _decode_tiff(data: memoryview, pixel: np.dtype[Any]) -> NDArray[Any]:
-    """(H, W) pixels of that type; as of a PNG, the header is checked first."""
+    """(H, W) pixels of the type `pixel`. The header is checked first, as for PNG."""
     sizes = {}
     try:
         order = {b'II': '<', b'MM': '>'}[bytes(data[:2])]
@@ -303,7 +312,7 @@ def _check_size(width: int, height: int) -> None:
 
 
 def _from_inverse_depth(units: NDArray[np.uint16], a: float, b: float) -> NDArray[np.float32]:
-    """Quantised inverse depth (H, W) -> metres: z = A / (q - B), and q = 0 is no reading."""
+    """Quantised inverse depth (H, W) -> metres: z = A / (q - B). q = 0 means no reading."""
     if not (np.isfinite([a, b]).all() and a > 0):
         raise InputError(f'inverse depth cannot be quantised with A={a}, B={b}: the header is corrupt')
     with np.errstate(divide='ignore', over='ignore'):
@@ -313,6 +322,6 @@ def _from_inverse_depth(units: NDArray[np.uint16], a: float, b: float) -> NDArra
 
 
 def _sanitised(depth: NDArray[np.float32]) -> NDArray[np.float32]:
-    """A contiguous copy (H, W) in which everything that is not a positive finite number is 0."""
+    """A contiguous copy (H, W). Everything that is not a positive finite number is 0 in it."""
     depth = np.ascontiguousarray(depth, np.float32)
     return np.asarray(cv2.copyTo(depth, cv2.inRange(depth, _SMALLEST, _LARGEST)))

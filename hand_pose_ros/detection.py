@@ -1,7 +1,7 @@
-"""Where in a depth image a hand may be: depth -> cubes. (`runtime.finder` says it by a network.)
+"""Where a hand may be in a depth image: depth -> cubes. (`runtime.finder` does the same with a network.)
 
-The paper's assumption is that the hand is the nearest object to the camera (section 3; Oberweger et al. 2015). Its
-detector is kept, with sizes in metres instead of pixels, no bias at the border of the image, and a minimum size.
+The paper assumes that the hand is the nearest object to the camera (section 3; Oberweger et al. 2015). This is its
+detector, but with sizes in metres instead of pixels, no bias at the border of the image, and a minimum size.
 """
 
 from __future__ import annotations
@@ -20,11 +20,13 @@ Region = tuple[int, int, int, int]
 """A rectangle of an image in pixels: x, y, width, height (as sensor_msgs/RegionOfInterest)."""
 
 MIN_AREA_M2 = 15e-4
-"""What is smaller than this, seen from the camera, is a speck or a cable: a fist seen end on has about 40 cm2."""
+"""An object that is smaller than this, seen from the camera, is a speck or a cable. A fist seen end on has about
+40 cm2."""
 MIN_CUBE_AREA_M2 = 25e-4
 """A cube must hold at least this much surface to hold a hand."""
 MAX_THROUGH = 0.5
-"""Share of two opposite sides that may both be cut: an arm leaves through one side, a table or a wall goes through."""
+"""Largest share of two opposite sides that may both be cut. An arm leaves through one side only; a table or a wall goes
+right through."""
 
 _WORK_WIDTH = 160
 _SLAB_M = 0.03
@@ -32,7 +34,7 @@ _ITERATIONS = 5
 
 
 class _Scene:
-    """A depth image thinned out to about 160 columns, with what each of its pixels measures in the world."""
+    """A depth image reduced to about 160 columns, with the position and area of its pixels in the world."""
 
     def __init__(self, depth: NDArray[np.float32], intrinsics: Intrinsics, near: float, far: float) -> None:
         self.stride = max(1, intrinsics.width // _WORK_WIDTH)
@@ -46,8 +48,9 @@ class _Scene:
 
     def inside(self, center: NDArray[np.float64], side: float,
                ) -> tuple[NDArray[np.float32], NDArray[np.bool_], slice, slice]:
-        """Depth in the window of a cube, which of it lies within the cube, and the window: the rows and columns whose
-        rays meet the plane of the cube's centre inside the cube.
+        """The depth in the window of a cube, a mask of what lies inside the cube, and the window (rows and columns).
+
+        The rays of the window's pixels meet the plane of the cube's centre inside the cube.
         """
         (x, y, middle), half = center, side / 2
         cols = slice(*np.searchsorted(self.x, [(x - half) / middle, (x + half) / middle]))
@@ -57,7 +60,8 @@ class _Scene:
 
     def centroid(self, z: NDArray[np.float32], mask: NDArray[np.bool_], rows: slice, cols: slice,
                  ) -> NDArray[np.float64]:
-        """Centre of mass of the masked pixels: mean position in the image and mean depth, as a point in metres."""
+        """Centre of mass of the masked pixels, from their mean position in the image and mean depth: a point in metres.
+        """
         count = mask.sum()
         depth = z[mask].mean(dtype=np.float64)
         x = mask.sum(0) @ self.x[cols] / count
@@ -67,18 +71,18 @@ class _Scene:
 
 def candidates(depth: NDArray[np.float32], intrinsics: Intrinsics, *, side: float = 0.30, near: float = 0.1,
                far: float = 1.5, regions: Sequence[Region] | None = None) -> Iterator[Cube]:
-    """Cubes around hand-sized objects, nearest first, each searched only when it is asked for.
+    """Cubes around hand-sized objects, the nearest first. Each is searched only when it is asked for.
 
-    Starting at the camera, everything nearer than a growing distance is looked at. The first connected piece of at
-    least MIN_AREA_M2 starts a cube, which moves to the centre of mass of what it holds (5 iterations, as the original
-    code does). A cube that holds too little, or that something goes right through, as a wall or a table does, is no
-    hand.
+    The search starts at the camera. It looks at everything nearer than a distance that grows. The first connected piece
+    of at least MIN_AREA_M2 starts a cube. This cube moves to the centre of mass of its content (5 iterations, as in the
+    original code). A cube is no hand if it holds too little, or if something goes right through it, like a wall or a
+    table.
 
     Args:
-        depth: (H, W) float32 metres, 0 = no reading.
+        depth: (H, W) float32, metres, 0 = no reading.
         side: of the cubes, metres.
         near, far: range in which hands are looked for, metres.
-        regions: what lies outside these rectangles does not count; None = the whole image.
+        regions: ignore everything outside these rectangles; None = use the whole image.
     """
     if regions is not None:
         inside = np.zeros(depth.shape, bool)
@@ -95,7 +99,7 @@ def candidates(depth: NDArray[np.float32], intrinsics: Intrinsics, *, side: floa
         nearer = (unseen & (z < limit)).view(np.uint8)
         count, labels, stats, _ = cv2.connectedComponentsWithStats(nearer, connectivity=4)
         for label in range(1, count):
-            # Nearly all pieces are specks: their number of pixels at the limit bounds their area from above.
+            # Nearly all pieces are specks. Their area is at most that of as many pixels at the limit.
             if stats[label, cv2.CC_STAT_AREA] * scene.pixel_area * limit ** 2 < MIN_AREA_M2:
                 continue
             piece = labels == label
@@ -106,21 +110,21 @@ def candidates(depth: NDArray[np.float32], intrinsics: Intrinsics, *, side: floa
             if not again and _may_hold_a_hand(scene, center, side, MAX_THROUGH):
                 found.append(Cube.at(center, side))
                 yield found[-1]
-            # Whatever it was, it has been judged: look behind and beside it.
+            # This object has been judged, so look behind and beside it.
             _, inside, rows, cols = scene.inside(center, side)
             unseen[rows, cols] &= ~inside
             unseen[piece] = False
 
 
 def detect(depth: NDArray[np.float32], intrinsics: Intrinsics, *, max_hands: int = 1, **where: Any) -> list[Cube]:
-    """The first `max_hands` of the `candidates`, which take the other arguments; empty when there are none."""
+    """The first `max_hands` of the `candidates`, or fewer. The other arguments are those of `candidates`."""
     return list(islice(candidates(depth, intrinsics, **where), max_hands))
 
 
 def _settle(scene: _Scene, unseen: NDArray[np.bool_], center: NDArray[np.float64], side: float) -> NDArray[np.float64]:
-    """Move a cube to the centre of mass of what it holds (original code; the paper trains on such centres).
+    """Move a cube to the centre of mass of its content (original code; the paper trains on such centres).
 
-    What an earlier cube held does not count: an elbow that was judged already must not draw the next cube to itself.
+    The content of earlier cubes does not count. An elbow that was already judged must not attract the next cube.
     """
     for _ in range(_ITERATIONS):
         z, inside, rows, cols = scene.inside(center, side)
@@ -141,8 +145,9 @@ def _may_hold_a_hand(scene: _Scene, center: NDArray[np.float64], side: float, ma
 
 def holds_a_hand(depth: NDArray[np.float32], intrinsics: Intrinsics, cube: Cube, *, near: float = 0.1,
                  far: float = 1.5, max_through: float = MAX_THROUGH) -> bool:
-    """Whether a tracked cube still holds an object that may be a hand: the honest test of being lost.
+    """Whether a tracked cube still holds an object that may be a hand. If not, the hand is lost.
 
-    With `max_through` 1 a table or a wall may go through it, for a network that tells a hand before one from none.
+    With `max_through` 1, a table or a wall may go through the cube. This is for networks that can tell a hand in front
+    of a table or a wall from no hand.
     """
     return _may_hold_a_hand(_Scene(depth, intrinsics, near, far), np.array(cube.center), cube.side, max_through)

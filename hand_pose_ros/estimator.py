@@ -1,7 +1,7 @@
 """One depth image in, the joints of its hands out: detect, crop, predict, uncrop.
 
-Numpy in and out; the networks run behind `runtime`. The estimator remembers the hands of the last image, so that the
-next one need not be searched.
+Input and output are numpy arrays. `runtime` runs the networks. The estimator remembers the hands of the last image, so
+it does not need to search the next one.
 """
 
 from __future__ import annotations
@@ -33,28 +33,34 @@ from hand_pose_ros.smoothing import OneEuroFilter
 __all__ = ['HandEstimate', 'HandPoseEstimator', 'Side']
 
 RECENTER_M = 0.03
-"""A cube whose centre is further than this from the middle of the joints it gave is moved there and read again. Half
-this distance is no more accurate on synthetic images, and costs two and a half times as many second readings."""
+"""If the mean of the joints is further than this from the centre of their cube, the cube is moved to that mean and read
+again. Half this distance is no more accurate on synthetic images, and needs two and a half times as many second
+readings."""
 READINGS = 3
-"""How often at most: on synthetic images two readings find a hand more often than one, three more often than two."""
+"""Maximum number of readings of a cube. On synthetic images, two readings find a hand more often than one, and three
+more often than two."""
 FALSE_ALARMS = 3
-"""After so many objects that are no hand, the search is given up until the next image."""
+"""After this many objects that are no hand, the search stops until the next image."""
 SEARCH_EVERY = 5
-"""While a hand is tracked, every so many images are worth a look at one more object: to search costs several times as
-much as to track."""
+"""While a hand is tracked, one image in this many is searched for one more object. Searching takes several times as
+long as tracking."""
 HOPELESS = 0.1
-"""Beside a hand, an object that scores less at first sight is not read again: it would cost the next image."""
+"""While there is another hand, an object whose first reading scores less than this is not read again. The time would be
+missing for the next image."""
 FRAME_S = 1 / 30
-"""Time between images for smoothing, where the caller does not say."""
+"""Time between images that smoothing assumes if the caller gives none."""
 SIDE_MEMORY = 0.95
-"""What a hand has shown of its side fades by this factor each image: about twenty images decide."""
+"""The evidence for the side of a hand fades by this factor with each image: about twenty images decide."""
 SETTLED = 5.0
-"""A side that has shown itself by more than this (logits) is not doubted until that has faded: about every
-thirtieth image. The scores of networks that do not judge sides never get there."""
+"""While the evidence for a side (logits) is more than this, the other side is not tried. It fades meanwhile, so both
+sides are tried in about every thirtieth image. The scores of networks that do not judge sides never reach this value.
+"""
 USUAL_SIZE = 0.166
-"""Metres from the wrist along the bones to the tip of the middle finger, of the hand that a usual cube is for."""
+"""Size of the hand that a usual cube is made for: metres from the wrist along the bones to the tip of the middle
+finger."""
 SIZE_IMAGES = 10
-"""So many images of a hand make half of what it tells of its size believed: a cube that fits is seen better."""
+"""After this many images of a hand, half of its measured size is believed. The network sees a hand better in a cube
+that fits."""
 
 
 @dataclass
@@ -63,27 +69,27 @@ class _Track:
 
     id: str
     center: NDArray[np.float64]
-    rightness: float = 0.0  # > 0: has looked more like a right hand
-    sizes: float = 0.0  # sum of logarithms of its size over the usual one
+    rightness: float = 0.0  # > 0: so far it looks more like a right hand
+    sizes: float = 0.0  # sum over the images of log(its size / the usual size)
     images: int = 0
     filter: OneEuroFilter | None = None
 
     @property
     def scale(self) -> float:
-        """Of its cube."""
+        """Factor by which its cube differs from the usual one."""
         return float(np.exp(np.clip(self.sizes / (self.images + SIZE_IMAGES), -0.2, 0.2)))
 
 
 @dataclass(frozen=True)
 class _Reading:
-    """What the network says of one cube: joints in metres, and how far it looked like a right hand."""
+    """What the network says about one cube: joints in metres, and how much it looks like a right hand."""
 
     cube: Cube
     joints: NDArray[np.float64]
     confidence: NDArray[np.float32]
     score: float
     rightness: float
-    size: float  # logarithm of the hand's over the usual one
+    size: float  # log(size of the hand / the usual size)
 
 
 @dataclass
@@ -92,22 +98,25 @@ class HandPoseEstimator:
 
     Args:
         engine: runs the network, `patches (N, 1, 128, 128) -> joints (N, J, 3)` in cube units of a right hand.
-        skeleton: the joints that the network gives.
-        find: where hands may be, the best place first: `detection.candidates` (the nearest things, as in the paper) or
-            a `runtime.finder.Finder`.
-        cube_side: length of the cube's side in metres; the network was trained for about this size. While a hand is
-            tracked, the usual one is scaled by the size that the network tells of the hand.
-        side: 'auto' finds out which hand it is; 'left' or 'right' states it.
-        max_hands: at most this many hands per image (the node and the command line take 2; evaluation, benchmarks and
-            labels are about one).
-        min_score: hands with a lower score are not reported; one beside another must begin with its square root.
+        skeleton: the joints that the network predicts.
+        find: returns the places where hands may be, the best place first. This is `detection.candidates` (the nearest
+            objects, as in the paper) or a `runtime.finder.Finder`.
+        cube_side: side of the cube in metres. The network was trained for about this size. While a hand is tracked, the
+            size that the weights were trained for is scaled by the size of the hand, as the network measures it; any
+            other size is kept.
+        side: 'auto' finds out whether a hand is left or right; 'left' or 'right' fixes it.
+        max_hands: maximum number of hands per image (the node and the command line use 2; evaluation, benchmarks and
+            labels are about one hand).
+        min_score: hands with a lower score are not reported. If there is another hand already, a new hand must reach
+            the square root of this value at first.
         near, far: range in which hands are looked for, metres.
         tracking: look first where the hands of the last image were.
-        smoothing: cutoff in Hz of a filter on the joints of a tracked hand at rest (see `smoothing`); 0 = none.
-        metadata: of the weights, for whoever publishes or writes joints (see `models.checkpoints`).
+        smoothing: cutoff in Hz of the filter on the joints of a tracked hand, for a hand at rest (see `smoothing`);
+            0 = no filter.
+        metadata: of the weights. Whoever publishes or writes joints needs it (see `models.checkpoints`).
 
     Raises:
-        InputError: there is no such side or range, a number is out of its range, or not one hand to look for.
+        InputError: the side or the range is invalid, a number is out of its range, or max_hands is less than 1.
     """
 
     engine: Engine
@@ -123,7 +132,7 @@ class HandPoseEstimator:
     smoothing: float = 0.0
     metadata: dict[str, Any] = field(default_factory=dict)
     timings: dict[str, float] = field(default_factory=dict, init=False)
-    """Seconds that each stage of the last image took: detect, crop, predict, uncrop."""
+    """Seconds for each stage of the last image: detect, crop, predict, uncrop."""
 
     def __post_init__(self) -> None:
         if self.side not in ('auto', 'left', 'right'):
@@ -150,15 +159,17 @@ class HandPoseEstimator:
         """An estimator with trained weights.
 
         Args:
-            model: name of weights that ship, or path of a checkpoint; None takes the default.
+            model: name of weights that ship, or path of a checkpoint; None = the default weights.
             device: 'auto', 'cpu', 'cuda' or 'cuda:N'.
-            num_threads: for the networks on the CPU; None chooses by the number of cores.
-            detector: how hands are found: by a network of their own, or as in the paper, as what is nearest.
+            num_threads: maximum number of threads for the networks on the CPU; None = chosen by the number of cores.
+            detector: how hands are found: 'network' uses a network of its own; 'nearest' takes the nearest object, as
+                in the paper.
             options: the other arguments of the class.
 
         Raises:
-            CheckpointError: there are no such weights, or they are damaged.
-            InputError: there is no such detector.
+            CheckpointError: the weights do not exist, or they are damaged.
+            HandPoseError: the device cannot be used here, num_threads is less than 1, or the network gives no joints.
+            InputError: the detector does not exist, or one of the options is invalid.
         """
         if detector not in ('network', 'nearest'):
             raise InputError(f"unknown detector '{detector}': choose network or nearest")
@@ -170,8 +181,8 @@ class HandPoseEstimator:
         return cls(engine, get_skeleton(checkpoint.metadata['skeleton']), metadata=checkpoint.metadata, **options)
 
     def warm_up(self) -> None:
-        """Let the engine prepare itself, so that the first image is answered as fast as the others."""
-        for patches in (1, 2):  # of one side, and of both
+        """Run the engine on empty patches, so that the first image does not take longer than the others."""
+        for patches in (1, 2):  # one side, and both sides
             self.engine.run_full(np.ones((patches, 1, PATCH_SIZE, PATCH_SIZE), np.float32))
 
     def reset(self) -> None:
@@ -180,16 +191,17 @@ class HandPoseEstimator:
 
     def __call__(self, depth: NDArray[np.float32], intrinsics: Intrinsics, *, time_s: float | None = None,
                  regions: Sequence[Region] | None = None) -> list[HandEstimate]:
-        """The hands in a depth image: tracked ones first, then those newly found, the likeliest first.
+        """The hands in a depth image: first the tracked hands, then the new ones in the order in which they are found.
 
         Args:
-            depth: (H, W) float32 metres, 0 = no reading.
+            depth: (H, W) float32, metres, 0 = no reading.
             intrinsics: of this very image.
-            time_s: when it was taken, for smoothing; without it, images are 1/30 s apart.
-            regions: look for new hands in these rectangles of the image (x, y, width, height) instead of everywhere.
+            time_s: time of the image in seconds, for smoothing. Without it, images are assumed to be 1/30 s apart.
+            regions: look for new hands only in these rectangles of the image (x, y, width, height).
 
         Raises:
-            InputError: the image is of another type or size than described.
+            InputError: the image has another type or shape, the intrinsics are for another size, or no lens can have
+                them.
         """
         if depth.ndim != 2 or depth.dtype != np.float32:
             raise InputError(f'a depth image must be (H, W) float32 in metres, not {depth.shape} {depth.dtype}: '
@@ -199,14 +211,15 @@ class HandPoseEstimator:
         self.timings = dict.fromkeys(('detect', 'crop', 'predict', 'uncrop'), 0.0)
 
         elapsed = 0.0 if time_s is None or self._last_s is None else time_s - self._last_s
-        # Two images of one time are of a driver that does not tell it.
+        # Two images with the same time come from a driver that does not set it.
         dt = elapsed if 0 < elapsed < math.inf else FRAME_S
         self._last_s = time_s
 
         hands: list[HandEstimate] = []
-        tracks, self._tracks = self._tracks if self.tracking else [], []  # what goes wrong with one is not met again
+        # Forget the tracks first: if one of them raises an error, the next image must not meet it again.
+        tracks, self._tracks = self._tracks if self.tracking else [], []
         for track in tracks:
-            usual = self.cube_side == self.metadata.get('cube_side')  # another was chosen with a hand in mind
+            usual = self.cube_side == self.metadata.get('cube_side')  # else the user chose the size for a certain hand
             cube = Cube.at(track.center, self.cube_side * (track.scale if usual else 1))
             with self._timed('detect'):
                 alive = len(hands) < self.max_hands and holds_a_hand(
@@ -223,8 +236,9 @@ class HandPoseEstimator:
               regions: Sequence[Region] | None) -> None:
         """Search for hands, add them to `hands`, and track them.
 
-        Without a hand, everything near is searched at once. Beside a tracked hand there is mostly none: then only every
-        so many images are searched, for one object that was not looked at before, until all were.
+        Without a hand, all objects in range are searched at once, up to FALSE_ALARMS that are no hand. If a hand is
+        tracked, there is mostly no other one. So only one image in SEARCH_EVERY is searched, for one object that was
+        not looked at before. When all were looked at, this starts again.
         """
         self._since_search += 1
         if not hands or len(hands) >= self.max_hands:
@@ -235,7 +249,7 @@ class HandPoseEstimator:
         with self._timed('detect'):
             cubes = iter(self.find(depth, intrinsics, side=self.cube_side, near=self.near, far=self.far,
                                    regions=regions))
-        # Objects that prove to be no hand must not hide one behind them, nor cost time without end.
+        # Objects that prove to be no hand must not hide a hand behind them. But they must not take endless time, too.
         while alarms > 0 and len(hands) < self.max_hands:
             with self._timed('detect'):
                 found = next(cubes, None)
@@ -246,7 +260,7 @@ class HandPoseEstimator:
                 continue
             track = _Track(id='', center=np.array(found.center))
             reading = self._read(depth, intrinsics, found, track, HOPELESS if hands else 0.0)
-            # Where there is a hand, a face or an elbow beside it often scores min_score, hardly ever its square root.
+            # Beside a hand, a face or an elbow often reaches min_score, but hardly ever its square root.
             enough = max(self.min_score, 0) ** 0.5 if hands else self.min_score
             if reading.score < enough or _overlaps(reading.cube, hands):
                 self._dismissed.append(found)
@@ -255,14 +269,14 @@ class HandPoseEstimator:
             track.id = f'hand_{next(self._ids)}'
             self._tracks.append(track)
             hands.append(self._follow(track, reading, dt))
-            if self.tracking:  # else what comes next would never be looked at
+            if self.tracking:  # else the next objects would never be looked at
                 alarms = min(alarms, 1)
 
     def _read(self, depth: NDArray[np.float32], intrinsics: Intrinsics, cube: Cube, track: _Track,
               hopeless: float = 0.0) -> _Reading:
-        """Look into a cube, and again where its joints are: from an arm that was found first, to the hand.
+        """Read a cube, move it to the joints that were found, and read again: from an arm that was found to the hand.
 
-        What scores less than `hopeless` is not read again.
+        A cube that scores less than `hopeless` is not read again.
         """
         reading = self._predict(depth, intrinsics, cube, track)
         for _ in range(READINGS - 1):
@@ -271,7 +285,7 @@ class HandPoseEstimator:
                     or reading.score < hopeless):
                 break
             reading = self._predict(depth, intrinsics, Cube.at(center, cube.side), track)
-        # Joints that are not in front of the camera are no hand, whatever the network thinks of them.
+        # Joints behind the camera are no hand, whatever the network says.
         return reading if reading.joints[:, 2].mean() > 0 else replace(reading, score=-1.0)
 
     def _predict(self, depth: NDArray[np.float32], intrinsics: Intrinsics, cube: Cube, track: _Track) -> _Reading:
@@ -289,19 +303,22 @@ class HandPoseEstimator:
             if mirrored[shown]:
                 coordinates[:, 0] *= -1
             size = 0.0
-            if 'size' in answer and self.skeleton.has_wrist:  # else it has not learned what it tells
+            if 'size' in answer and self.skeleton.has_wrist:  # without a wrist, the network has not learned the size
                 size = float(answer['size'][shown]) + math.log(TOLD_SIZE * cube.side / USUAL_SIZE)
             return _Reading(cube, cube.from_cube(coordinates), confidence[shown], float(score[shown]), rightness, size)
 
     def _mirrorings(self, track: _Track) -> tuple[bool, ...]:
-        """The network knows right hands: a left one is shown to it in the mirror, and of an unknown one, both."""
+        """Whether to mirror the patch, for each time that the network sees it.
+
+        The network knows right hands only. A left hand is mirrored. If the side is unknown, the network sees both.
+        """
         if self.side != 'auto':
             return (self.side == 'left',)
         return (track.rightness < 0,) if abs(track.rightness) > SETTLED else (False, True)
 
     def _judge(self, patches: NDArray[np.float32], answer: dict[str, NDArray[np.float32]], cube: Cube,
                ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Confidence of the joints (N, J), score (N,), and how far each looks like a right hand (N,), of N patches.
+        """For N patches: confidence of the joints (N, J), score (N,), and how much it looks like a right hand (N,).
 
         See `scoring`.
         """
@@ -322,7 +339,7 @@ class HandPoseEstimator:
                 track.filter = OneEuroFilter(self.smoothing)
             joints = track.filter(joints, dt)
         else:
-            track.filter = None  # which would remember where the hand was when it is switched on again
+            track.filter = None  # when it is switched on again, it must not remember where the hand was before
         side: Side = self.side if self.side != 'auto' else 'right' if track.rightness >= 0 else 'left'
         return HandEstimate(joints.astype(np.float32), self.skeleton.joint_names, reading.confidence,
                             reading.score, side, reading.cube, track.id)
@@ -335,6 +352,6 @@ class HandPoseEstimator:
 
 
 def _overlaps(cube: Cube, hands: Iterable[HandEstimate], others: Iterable[Cube] = ()) -> bool:
-    """Whether a cube looks at a hand that was already found, or at what one of the others looks at."""
+    """Whether a cube is at a hand that was already found, or at one of the other cubes."""
     seen = [*(hand.cube for hand in hands), *others]
     return any(np.linalg.norm(np.subtract(cube.center, other.center)) < cube.side / 3 for other in seen)

@@ -1,7 +1,7 @@
 """Pinhole camera, the metric cube around a hand, and the crop that a network sees.
 
-Everything is in metres and in the camera's optical frame (x right, y down, z forward; REP-103). Pixel (u, v) has u to
-the right, and integers are pixel centres.
+Everything is in metres and in the camera's optical frame (x right, y down, z forward; REP-103). In pixel (u, v), u
+points to the right, and integers are pixel centres.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from hand_pose_ros.errors import InputError
 PATCH_SIZE = 128
 """Width and height of a patch in pixels (paper, section 3)."""
 MAX_SLOPE, MIN_SLOPE = 3.0, 1e-4
-"""Of the rays at the border of an image against the axis of the camera (71.6 degrees, and a fraction of a minute of
-arc). Beyond them the intrinsics are those of no lens."""
+"""Largest and smallest slope of the rays at the border of an image against the axis of the camera (71.6 degrees, and a
+fraction of a minute of arc). No lens has intrinsics beyond these limits."""
 MAX_RATIO = 3.0
-"""Of the two focal lengths: pixels may be binned in one direction."""
+"""Largest ratio of the two focal lengths. Pixels may be binned in one direction only."""
 
 
 @dataclass(frozen=True)
@@ -48,12 +48,12 @@ class Intrinsics:
     def from_camera_info(cls, info: Any, *, rectified: bool = True) -> Intrinsics:
         """The intrinsics of the image that a sensor_msgs/CameraInfo belongs to (any object with its fields).
 
-        `rectified` takes the projection matrix P where it is filled in, else (and otherwise) the raw matrix K. Binning
-        and the region of interest are applied: both describe how the published image was cut out of the full sensor
-        (sensor_msgs/CameraInfo).
+        With `rectified`, they come from the projection matrix P if it is filled in. Otherwise they come from the raw
+        matrix K. Binning and the region of interest are applied: both describe how the published image was cut out of
+        the full sensor (sensor_msgs/CameraInfo).
 
         Raises:
-            InputError: K is zero (an uncalibrated camera) or the size is empty.
+            InputError: the matrix is zero (an uncalibrated camera) or not usable, or the size is empty.
         """
         k, p = [*map(float, info.k)], [*map(float, info.p)]
         fx, fy, cx, cy = (p[0], p[5], p[2], p[6]) if rectified and p[0] != 0 else (k[0], k[4], k[2], k[5])
@@ -68,14 +68,14 @@ class Intrinsics:
                    width=width // bin_x, height=height // bin_y)
 
     def check_size(self, width: int, height: int) -> None:
-        """Raise InputError unless the intrinsics belong to an image of this size."""
+        """Raise InputError if the intrinsics belong to an image of another size."""
         if (width, height) != (self.width, self.height):
             raise InputError(
                 f'the depth image has {width}x{height} pixels but its intrinsics are for {self.width}x{self.height}: '
                 'use those of this very image (the camera_info that is published beside it)')
 
     def check_lens(self) -> None:
-        """Raise InputError if no lens can have these intrinsics: what is computed with them may be anything."""
+        """Raise InputError if no lens can have these intrinsics. Results computed with them would be meaningless."""
         for focal, center, size in ((self.fx, self.cx, self.width), (self.fy, self.cy, self.height)):
             if max(abs(center), abs(size - center)) > MAX_SLOPE * focal or size < MIN_SLOPE * focal:
                 raise InputError(f'a focal length of {focal:g} and a principal point at {center:g} pixels are those of '
@@ -92,7 +92,7 @@ class Intrinsics:
         return np.stack([points[..., 0] / z * self.fx + self.cx, points[..., 1] / z * self.fy + self.cy], axis=-1)
 
     def back_project(self, pixels: ArrayLike, z: ArrayLike) -> NDArray[np.float64]:
-        """Pixels (..., 2) and their depth (...) in metres -> points (..., 3) in metres."""
+        """Pixels (..., 2) and their depths (...) in metres -> points (..., 3) in metres."""
         pixels, z = np.asarray(pixels, np.float64), np.asarray(z, np.float64)
         x, y = (pixels[..., 0] - self.cx) / self.fx, (pixels[..., 1] - self.cy) / self.fy
         return np.stack([x * z, y * z, z], axis=-1)
@@ -100,12 +100,12 @@ class Intrinsics:
 
 @dataclass(frozen=True)
 class Cube:
-    """The metric cube in which a hand is looked for: `center` (x, y, z) and length of a `side`, in metres.
+    """The metric cube in which a hand is looked for: its `center` (x, y, z) and the length of its `side`, in metres.
 
-    *Cube units* of a point are its position in the patch and its depth: column and row of the patch in [-1, 1], and
-    depth from the front face (-1) to the back face (+1). They follow the rays of the camera, as the patch does, so that
-    a network sees exactly what it is asked for, wherever in the image the hand is. (The original code takes metric
-    offsets from the centre instead; the two differ by the perspective inside the cube.)
+    The *cube units* of a point are its position in the patch and its depth: column and row of the patch in [-1, 1], and
+    depth from the front face (-1) to the back face (+1). They follow the rays of the camera, as the patch does. So the
+    network sees exactly what it is asked for, wherever the hand is in the image. (The original code uses metric offsets
+    from the centre instead. The two differ by the perspective inside the cube.)
     """
 
     center: tuple[float, float, float]
@@ -130,7 +130,7 @@ class Cube:
         return (on_plane - np.array([x, y, z])) / (self.side / 2)
 
     def from_cube(self, coordinates: ArrayLike) -> NDArray[np.float64]:
-        """Cube units (..., 3) -> points (..., 3) in metres; the exact inverse of `to_cube`."""
+        """Cube units (..., 3) -> points (..., 3) in metres. The exact inverse of `to_cube`."""
         x, y, z = self.center
         points = np.asarray(coordinates, np.float64) * (self.side / 2) + np.array([x, y, z])
         points[..., :2] *= points[..., 2:3] / z
@@ -138,11 +138,11 @@ class Cube:
 
 
 def crop(depth: NDArray[np.float32], cube: Cube, intrinsics: Intrinsics, size: int = PATCH_SIZE) -> NDArray[np.float32]:
-    """What lies in the cube, as a patch (1, size, size) in [-1, 1] (paper, section 3; nearest neighbour).
+    """The content of the cube, as a patch (1, size, size) in [-1, 1] (paper, section 3; nearest neighbour).
 
-    -1 is the front face of the cube, +1 the back face. No reading (0 in `depth`, or outside the image) and everything
-    behind the back face are +1; whatever is before the front face is -1, so that a finger that leaves the cube towards
-    the camera stays visible.
+    -1 is the front face of the cube, +1 is the back face. Pixels without a reading (0 in `depth`, or outside the image)
+    and everything behind the back face are +1. Everything in front of the front face is -1, so a finger that leaves the
+    cube towards the camera stays visible.
 
     Args:
         depth: (H, W) float32 in metres, 0 = no reading.
@@ -154,11 +154,12 @@ def crop(depth: NDArray[np.float32], cube: Cube, intrinsics: Intrinsics, size: i
     affine = np.array([[intrinsics.fx * step, 0, u + intrinsics.fx * step * (0.5 - size / 2)],
                        [0, intrinsics.fy * step, v + intrinsics.fy * step * (0.5 - size / 2)]])
     patch = np.empty((size, size), np.float32)
-    depth = np.asarray(depth, np.float32)  # given another type, OpenCV leaves `patch` as it is
+    depth = np.asarray(depth, np.float32)  # with another type, OpenCV would not write to `patch`
     cv2.warpAffine(depth, affine, (size, size), dst=patch, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
                    borderMode=cv2.BORDER_CONSTANT, borderValue=0)
     nothing = ~(patch > 0)  # NaN, too
-    # Before the division, since a reading may be any float; not yet to the faces, which would round to not quite 1.
+    # Clip before the division, because a reading may be any float. But not to the faces yet: they would be rounded to
+    # not quite 1.
     np.clip(patch, z - 2 * half, z + 2 * half, out=patch)
     patch -= z
     patch /= half

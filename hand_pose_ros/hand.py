@@ -1,4 +1,4 @@
-"""What is known of a hand in an image."""
+"""What is known about one hand in one image."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from hand_pose_ros.geometry import Cube
 Side = Literal['left', 'right', 'unknown']
 
 
-@dataclass(frozen=True, eq=False)  # arrays cannot tell in one word whether they are equal
+@dataclass(frozen=True, eq=False)  # comparing arrays does not give one True or False
 class HandEstimate:
     """One hand in one image.
 
     Attributes:
         joints: (J, 3) float32, metres, optical frame of the camera.
         joint_names: the J names, in the order of the skeleton.
-        confidence: (J,) float32 in [0, 1].
+        confidence: (J,) float32, one per joint, in [0, 1].
         score: of the whole hand, in [0, 1].
         side: 'left', 'right' or 'unknown'.
-        cube: what the network looked at.
-        id: the same from image to image as long as the hand is tracked.
+        cube: where the network looked.
+        id: stays the same from image to image while the hand is tracked.
     """
 
     joints: NDArray[np.float32]

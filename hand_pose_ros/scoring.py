@@ -1,7 +1,7 @@
 """Confidence of joints and score of hands.
 
-A network that has learned to judge itself is believed (`learned`). The paper's networks answer with joints and nothing
-else, whatever they are shown; of these, the joints are held against the depth they came from (`explain`).
+Some networks have learned to judge themselves: their judgement is used (`learned`). The networks of the paper give only
+joints, whatever they see. Their joints are compared with the depth image that they came from (`explain`).
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ from numpy.typing import NDArray
 from hand_pose_ros.skeleton import Skeleton
 
 JOINT_TOLERANCE_M = 0.008
-"""How far beside the silhouette, or before the surface, a joint may come to lie: about the radius of a finger."""
+"""Tolerance for a joint beside the silhouette, or in front of the surface: about the radius of a finger."""
 FLESH_M = 0.025
-"""A joint further than this behind the surface is hidden by something else than its own flesh."""
+"""A joint that is further than this behind the surface is hidden by something other than its own flesh."""
 HIDDEN_CONFIDENCE = 0.5
-"""Of a joint for which there is no evidence either way."""
+"""Confidence of a joint without evidence for or against it."""
 REACH_M = 0.022
-"""Surface further than this from every bone is not explained by the skeleton."""
+"""The skeleton does not explain surface that is further than this from every bone."""
 
 
 def learned(confidence: NDArray[np.float32], hand: NDArray[np.float32],
             ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Confidence of each joint (N, J) and score (N,) from the logits that a network gives of N patches.
+    """Confidence of each joint (N, J) and score (N,), from the logits of a network for N patches.
 
-    The score is the share of joints that can be expected to be right: the probability that this is a hand, times the
-    mean confidence of its joints. Either alone lets things pass that the other knows to be wrong.
+    The score is the expected share of joints that are right: the probability that this is a hand, times the mean
+    confidence of its joints. Each of the two alone would accept objects that the other rejects.
     """
     confidence, hand = _sigmoid(confidence), _sigmoid(hand)
     return confidence, hand * confidence.mean(axis=1)
@@ -42,9 +42,9 @@ def explain(patch: NDArray[np.float32], joints: NDArray[np.floating], side: floa
             skeleton: Skeleton) -> tuple[NDArray[np.float32], float]:
     """Confidence of each joint (J,) and score of the hand, both in [0, 1].
 
-    A joint is inside the hand: on the silhouette and behind the visible surface. And a skeleton that belongs to a hand
-    leaves little of the surface unexplained (that of the forearm, beyond the wrist, excepted). The score is the mean
-    confidence times the share of the surface that is explained.
+    A joint should be inside the hand: on the silhouette and behind the visible surface. And the skeleton of a hand
+    should explain most of the surface, except that of the forearm beyond the wrist. The score is the mean confidence
+    times the share of the surface that is explained.
 
     Args:
         patch: (1, S, S) in [-1, 1].
@@ -67,8 +67,8 @@ def explain(patch: NDArray[np.float32], joints: NDArray[np.floating], side: floa
 
 
 def _explained(surface: NDArray[np.float32], joints: NDArray[np.floating], half: float, skeleton: Skeleton) -> float:
-    """Share of the visible surface within reach of a bone, not counting the forearm."""
-    some = surface[::2, ::2]  # every other row and column will do
+    """Share of the visible surface within reach of a bone, without the forearm."""
+    some = surface[::2, ::2]  # every other row and column is enough
     rows, columns = (2 * index for index in np.nonzero((some < 1) & (some > -1)))
     scale = 2 / surface.shape[0]
     points = np.stack([(columns + 0.5) * scale - 1, (rows + 0.5) * scale - 1, surface[rows, columns]], dtype=np.float32)
@@ -80,7 +80,7 @@ def _explained(surface: NDArray[np.float32], joints: NDArray[np.floating], half:
         return 0.0
     parents, children = np.array(skeleton.bones).T
     start, bone = joints[parents], joints[children] - joints[parents]
-    # |p - (a + t b)|^2 over all bones and points, with t clamped to the bone, from dot products only.
+    # |p - (a + t b)|^2 for all bones and points, with t clamped to the bone, computed from dot products only.
     along = bone @ points - (start * bone).sum(1, keepdims=True)
     length2 = np.maximum((bone ** 2).sum(1, keepdims=True), 1e-12)
     t = np.clip(along / length2, 0, 1)

@@ -11,7 +11,7 @@ FINGERS = ('thumb', 'index', 'middle', 'ring', 'pinky')
 
 @dataclass(frozen=True)
 class Skeleton:
-    """Joints in order, and for each the index of its parent (-1 = root)."""
+    """Joints in their order, and for each joint the index of its parent (-1 = root)."""
 
     name: str
     joint_names: tuple[str, ...]
@@ -27,12 +27,12 @@ class Skeleton:
 
     @property
     def fingers(self) -> tuple[str, ...]:
-        """For each joint the finger it belongs to, or 'palm'."""
+        """For each joint, the finger that it belongs to, or 'palm'."""
         return tuple(next((f for f in FINGERS if name.startswith(f)), 'palm') for name in self.joint_names)
 
     @property
     def knuckles(self) -> tuple[int, ...]:
-        """Indices of the joints that the fingers begin with, without the thumb; their parent is the root."""
+        """Indices of the first joints of the fingers without the thumb. Their parent is the root."""
         return tuple(joint for joint, finger in enumerate(self.fingers)
                      if self.parents[joint] == self.root and finger not in ('palm', 'thumb'))
 
@@ -43,12 +43,12 @@ class Skeleton:
 
     @property
     def has_wrist(self) -> bool:
-        """Whether the fingers begin there; if at the palm, bones do not tell the length of a hand."""
+        """Whether the root is the wrist. If it is the palm, the bones do not give the length of the hand."""
         return self.joint_names[self.root] == 'wrist'
 
     @property
     def middle_finger(self) -> tuple[int, ...]:
-        """Indices from its tip to the root: the bones between them make the length of a hand, if `has_wrist`."""
+        """Indices from its tip to the root. The bones between them add up to the length of the hand, if `has_wrist`."""
         chain = [self.joint_names.index('middle_tip')]
         while self.parents[chain[-1]] >= 0:
             chain.append(self.parents[chain[-1]])
@@ -56,7 +56,7 @@ class Skeleton:
 
     @property
     def tips(self) -> tuple[int, ...]:
-        """Indices of the fingertips, thumb to little finger."""
+        """Indices of the fingertips, from thumb to little finger."""
         return tuple(self.joint_names.index(f'{finger}_tip') for finger in FINGERS)
 
 
@@ -65,11 +65,11 @@ def _hand(name: str, joints: str, parents: tuple[int, ...]) -> Skeleton:
 
 
 SKELETONS = {skeleton.name: skeleton for skeleton in (
-    # Ours: the wrist, four joints per digit, root to tip.
+    # Ours: the wrist, then four joints per digit, from root to tip.
     _hand('hand21', 'wrist thumb_cmc thumb_mcp thumb_ip thumb_tip '
           + ' '.join(f'{f}_{j}' for f in FINGERS[1:] for j in ('mcp', 'pip', 'dip', 'tip')),
           (-1, 0, 1, 2, 3, 0, 5, 6, 7, 0, 9, 10, 11, 0, 13, 14, 15, 0, 17, 18, 19)),
-    # NYU, the 14 of the 36 that are evaluated (Tompson et al. 2014), little finger first, tip before middle.
+    # NYU (Tompson et al. 2014): the 14 of the 36 joints that are evaluated, little finger first, tip before middle.
     _hand('nyu14', 'pinky_tip pinky_mid ring_tip ring_mid middle_tip middle_mid index_tip index_mid '
           'thumb_tip thumb_ip thumb_mcp wrist_left wrist_right palm',
           (1, 13, 3, 13, 5, 13, 7, 13, 9, 10, 13, 13, 13, -1)),
@@ -86,10 +86,10 @@ HAND21 = SKELETONS['hand21']
 
 
 def get_skeleton(name: str) -> Skeleton:
-    """The skeleton of this name.
+    """The skeleton with this name.
 
     Raises:
-        HandPoseError: there is none.
+        HandPoseError: there is no such skeleton.
     """
     if name not in SKELETONS:
         raise HandPoseError(f"unknown skeleton '{name}': choose one of {', '.join(SKELETONS)}")

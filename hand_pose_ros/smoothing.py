@@ -1,4 +1,4 @@
-"""The 1 euro filter: steady when the hand rests, quick when it moves (Casiez, Roussel, Vogel 2012)."""
+"""The 1 euro filter: steady while the hand rests, quick while it moves (Casiez, Roussel, Vogel 2012)."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 DERIVATIVE_CUTOFF_HZ = 1.0
-"""Of the low-pass filter on the speed, as in the paper."""
+"""Cutoff of the low-pass filter on the speed, as in the paper."""
 
 
 class OneEuroFilter:
-    """A low-pass filter whose cutoff grows with the speed of what it filters.
+    """A low-pass filter. Its cutoff grows with the speed of the points.
 
     Args:
-        cutoff_hz: at rest; lower is steadier.
-        gain: by how many Hz the cutoff grows per metre per second; higher lags less.
+        cutoff_hz: cutoff at rest; lower is steadier.
+        gain: the cutoff grows by this many Hz per metre per second; higher lags less.
     """
 
     def __init__(self, cutoff_hz: float, gain: float = 30.0) -> None:
@@ -25,7 +25,7 @@ class OneEuroFilter:
         self._speed: NDArray[np.float64] = np.zeros(())
 
     def __call__(self, value: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
-        """Filter points (..., 3) in metres, `dt` seconds after the last ones; each point has a speed of its own."""
+        """Filter points (..., 3) in metres, `dt` seconds after the last ones. Each point has its own speed."""
         last = self._value
         if last is None or dt <= 0:
             self._value, self._speed = value, np.zeros((*value.shape[:-1], 1))
@@ -38,6 +38,6 @@ class OneEuroFilter:
 
 
 def _share(cutoff_hz: NDArray[np.float64] | float, dt: float) -> NDArray[np.float64] | float:
-    """How much of the new value a first-order low-pass filter takes."""
+    """The weight of the new value in a first-order low-pass filter."""
     rate = 2 * math.pi * cutoff_hz * dt
     return rate / (rate + 1)

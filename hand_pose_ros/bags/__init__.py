@@ -1,4 +1,4 @@
-"""Bags without ROS: depth images with their camera out of ROS 1, sqlite3 and MCAP bags, and hands into new ones."""
+"""Bags without ROS: read depth images and camera_info from ROS 1, sqlite3 and MCAP bags; write hands to new ones."""
 
 from hand_pose_ros.bags.bag import Bag
 from hand_pose_ros.bags.reader import DepthBag, Frame, RecordedHands, check_frame, read_hands

@@ -1,4 +1,4 @@
-"""A bag of any kind: its topics and its serialized messages, as far as they can be read."""
+"""A bag of any kind: its topics, and as many of its serialized messages as can be read."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ IMAGE, COMPRESSED_IMAGE = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedIm
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
 HAND, HANDS, SKELETON = (f'hand_pose_ros/msg/{name}' for name in ('HandJoints', 'HandJointsArray', 'HandSkeleton'))
 SIDES = ('unknown', 'left', 'right')
-"""The names of HandJoints.side, in the order of its constants."""
+"""The names of the values of HandJoints.side, in their order."""
 
 _Self = TypeVar('_Self', bound='Bag')
 
@@ -40,11 +40,11 @@ def typestore() -> Typestore:
 class Bag:
     """Any bag, open for reading: a ROS 1 file, a ROS 2 folder, or one of its .mcap or .db3 files.
 
-    A ROS 2 folder without metadata.yaml and an MCAP file without its end, as interrupted recordings leave them, are
-    read as far as they go.
+    An interrupted recording leaves a ROS 2 folder without metadata.yaml, or an MCAP file without its end. They are read
+    as far as possible.
 
     Raises:
-        InputError: the bag is missing, of no known kind, or damaged beyond what can be read.
+        InputError: the bag is missing, of an unknown kind, or too damaged to be read.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -61,17 +61,17 @@ class Bag:
         """Connection, time of recording [ns] and serialized data of each message, in the order of time.
 
         Args:
-            start: leave out what was recorded before this time, ns.
+            start: leave out messages recorded before this time, ns.
 
         Raises:
-            InputError: where the bag is damaged, after everything before the damage.
+            InputError: the bag is damaged, or was cut short. Everything before the damage comes first.
         """
         count = 0
         try:
             for message in self._reader.messages(connections=connections, start=start):
                 yield message
                 count += 1
-        except Exception as error:  # errors of sqlite and of the decompressors come through as they are
+        except Exception as error:  # sqlite and the decompressors raise errors of their own
             self._check_open()
             raise InputError(f'{self.path}: the bag is damaged after {count} messages ({_said(error)}); '
                              f'{_remedy(self.path)}') from error
@@ -80,7 +80,11 @@ class Bag:
                              f'recording or copy; {_remedy(self.path)}')
 
     def first(self, connection: Connection) -> Any:
-        """The first message of a connection, None if it has none."""
+        """The first message of a connection; None if it has none.
+
+        Raises:
+            InputError: the bag or the message is damaged.
+        """
         if connection.msgcount == 0:
             return None
         for _, _, data in self.messages([connection]):
@@ -89,19 +93,23 @@ class Bag:
                          f'{_remedy(self.path)}')
 
     def deserialize(self, connection: Connection, data: bytes) -> Any:
-        """The message as an object with the fields of its definition."""
+        """The message as an object with the fields of its definition.
+
+        Raises:
+            InputError: the message is damaged.
+        """
         try:
             return self._reader.deserialize(data, connection.msgtype)
-        except Exception as error:  # whatever random bytes provoke
+        except Exception as error:  # random bytes can cause any error
             self._check_open()
-            if bytes(data[:4]) == b'\x28\xb5\x2f\xfd':  # of zstd; only metadata.yaml tells that messages are compressed
+            if bytes(data[:4]) == b'\x28\xb5\x2f\xfd':  # zstd; only metadata.yaml says that messages are compressed
                 raise InputError(f'{self.path}: its messages are compressed, as metadata.yaml says: give the folder '
                                  'that holds both, or make it anew with: ros2 bag reindex FOLDER') from error
             raise InputError(f'{self.path}: a message on {connection.topic} is damaged ({_said(error)}): record or '
                              'copy the bag again') from error
 
     def close(self) -> None:
-        """Close the files; the bag cannot be read any more."""
+        """Close the files. After this, the bag cannot be read."""
         if not self._closed:
             self._closed = True
             self._reader.close()
@@ -118,7 +126,7 @@ class Bag:
 
 
 def _open(path: Path) -> tuple[AnyReader, bool]:
-    """A reader of the bag, and whether it only sees what an interrupted recording left."""
+    """A reader of the bag, and whether it reads only what an interrupted recording has left."""
     if not path.exists():
         raise InputError(f'{path}: there is no such bag: check the path')
     attempts: list[Any] = [PathForSqlite(path)]
@@ -138,20 +146,20 @@ def _open(path: Path) -> tuple[AnyReader, bool]:
                 return reader, interrupted
             reader.close()
             failure = InputError('it was cut short before its first chunk was complete')
-        except Exception as error:  # errors of sqlite, YAML and of the decompressors come through as they are
+        except Exception as error:  # sqlite, YAML and the decompressors raise errors of their own
             failure = failure or error
     raise InputError(f'{path}: the bag cannot be opened ({_said(failure)}); {_remedy(path)}') from failure
 
 
 class PathForSqlite(type(Path())):  # type: ignore[misc]
-    """A path as rosbags, which puts it into a URI of SQLite as it is, must be given it: %, ? and # mean more there."""
+    """A path that quotes itself. rosbags puts it into a URI of SQLite, where %, ? and # have a special meaning."""
 
     def __format__(self, _spec: str) -> str:
         return quote(os.fsencode(self))
 
 
 def _said(error: Exception | None) -> str:
-    """What a library said, in one line; its kind if it said nothing."""
+    """The error message of a library, in one line; the type of the error if there is no message."""
     return ' '.join(str(error).split()) or type(error).__name__
 
 
@@ -172,7 +180,7 @@ def _remedy(path: Path) -> str:
 
 
 class _InterruptedMcap:
-    """An MCAP file without its end, shown to rosbags as if it had been closed after its last complete record."""
+    """An MCAP file without its end. For rosbags it looks as if it had been closed after its last complete record."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -190,24 +198,24 @@ class _InterruptedMcap:
 
 
 _MCAP_MAGIC = b'\x89MCAP0\r\n'
-_MCAP_END = struct.pack('<BQQQI', 2, 20, 0, 0, 0) + _MCAP_MAGIC  # a footer that says that there is no summary
+_MCAP_END = struct.pack('<BQQQI', 2, 20, 0, 0, 0) + _MCAP_MAGIC  # this footer says that there is no summary
 
 
 def _complete_records(file: BinaryIO) -> int:
-    """Where the last complete record of the data section of an MCAP file ends."""
+    """The end of the last complete record in the data section of an MCAP file, in bytes."""
     size = file.seek(0, io.SEEK_END)
     end = len(_MCAP_MAGIC)
     while end + 9 <= size:
         file.seek(end)
         kind, length = struct.unpack('<BQ', file.read(9))
-        if kind in (0x00, 0x02, 0x0f) or end + 9 + length > size:  # never written, footer, end of data
+        if kind in (0x00, 0x02, 0x0f) or end + 9 + length > size:  # not written, footer, end of data
             break
         end += 9 + length
     return end
 
 
 class _Joined(io.RawIOBase):
-    """The first `length` bytes of a file and `tail` behind them, as one file."""
+    """The first `length` bytes of a file, followed by `tail`, as one file."""
 
     def __init__(self, file: BinaryIO, length: int, tail: bytes) -> None:
         self._file, self._length, self._tail, self._at = file, length, tail, 0

@@ -1,4 +1,4 @@
-"""Depth images with their intrinsics, and recorded hands, out of a bag."""
+"""Read depth images with their intrinsics, and recorded hands, from a bag."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from hand_pose_ros.skeleton import SKELETONS
 
 @dataclass(frozen=True)
 class Frame:
-    """One depth image of a bag. Depth and intrinsics are worked out when asked for, and may raise InputError.
+    """One depth image of a bag. `depth` and `intrinsics` are computed at first use, and may raise InputError.
 
     Attributes:
         stamp_ns: of the header.
         frame_id: of the header.
-        topic: where it was recorded.
-        recorded_ns: when it was recorded.
+        topic: the topic on which the image was recorded.
+        recorded_ns: the time at which the image was recorded.
     """
 
     stamp_ns: int
@@ -42,13 +42,13 @@ class Frame:
 
     @cached_property
     def depth(self) -> NDArray[np.float32]:
-        """(H, W) metres, 0 = no reading."""
+        """(H, W) float32, metres, 0 = no reading."""
         decode = decode_compressed if hasattr(self._message, 'format') else decode_image
         return decode(self._message, self._depth_scale, source=self.topic)
 
     @cached_property
     def intrinsics(self) -> Intrinsics:
-        """Those of this image; the size of the camera_info is checked."""
+        """The intrinsics of this image. The camera_info must have the size of the image."""
         height, width = self.depth.shape
         if isinstance(self._camera, Intrinsics):
             with naming(self.topic):
@@ -63,13 +63,13 @@ class DepthBag(Bag):
 
     Args:
         path: a bag of any kind.
-        depth_topic: sensor_msgs/Image or CompressedImage; can be left out if only one topic carries depth.
+        depth_topic: a topic of sensor_msgs/Image or CompressedImage; not needed if only one topic carries depth.
         camera_info_topic: by default `camera_info` beside the depth topic.
-        intrinsics: (fx, fy, cx, cy) in pixels, instead of the camera_info.
+        intrinsics: (fx, fy, cx, cy) in pixels, used instead of the camera_info.
         depth_scale: metres per unit of 16-bit depth; by default 0.001.
 
     Raises:
-        InputError: no depth topic, several to choose from, or no camera_info.
+        InputError: the bag cannot be read, has no depth topic, or several to choose from, or has no camera_info.
     """
 
     def __init__(self, path: str | os.PathLike[str], depth_topic: str | None = None,
@@ -93,19 +93,19 @@ class DepthBag(Bag):
         self._unusable = ''
 
     def __len__(self) -> int:
-        """How many depth images there are."""
+        """The number of depth images."""
         return sum(connection.msgcount for connection in self._images)
 
     def __iter__(self) -> Iterator[Frame]:
-        """The frames in the order of recording, each with the newest camera_info of its frame_id.
+        """The frames in the order of recording, each with the newest camera_info that has its frame_id.
 
         Raises:
-            InputError: where the bag is damaged, after the frames before the damage.
+            InputError: the bag is damaged, or no camera_info can be used. The frames before the damage come first.
         """
         cameras: dict[str, Intrinsics] = {}
         count = 0
         try:
-            for connection in self._infos:  # an image that was recorded before its camera_info takes the first one
+            for connection in self._infos:  # images that were recorded before their camera_info use the first one
                 for _, _, data in self.messages([connection]):
                     if self._remember(connection, self.deserialize(connection, data), cameras):
                         break
@@ -126,20 +126,20 @@ class DepthBag(Bag):
             raise InputError(f'{error} ({count} of {len(self)} depth images were read)') from error
 
     def _remember(self, connection: Connection, info: Any, cameras: dict[str, Intrinsics]) -> bool:
-        """Keep the intrinsics as the newest of their frame_id, and as the newest of all under ''; False if unusable."""
-        if self.is_ros1:  # K, D, R and P became lower-case in ROS 2
+        """Keep the intrinsics as the newest for their frame_id, and under '' as the newest. False if unusable."""
+        if self.is_ros1:  # K, D, R and P are lower-case in ROS 2
             info = SimpleNamespace(**{name.lower(): value for name, value in vars(info).items()})
         try:
             cameras[info.header.frame_id] = cameras[''] = Intrinsics.from_camera_info(info)
-        except InputError as error:  # some drivers begin with one that is empty
+        except InputError as error:  # the first camera_info of some drivers is empty
             self._unusable = f'{self.path}: {connection.topic}: {error}; or give --intrinsics FX FY CX CY'
             return False
         return True
 
     def _find_depth_topic(self) -> str:
         depth = {connection.topic for connection in self.connections if self._carries_depth(connection)}
-        # The transports of one image are one candidate, and the raw one needs the least work; compressed ones may have
-        # lost something.
+        # All transports of an image are one candidate. The raw one comes first: it needs the least work, and the
+        # compressed ones may have lost something.
         images = {split_transport(topic)[0] for topic in depth}
         ways = ([join_transport(image, transport) for transport in TRANSPORTS] for image in images)
         topics = sorted(next(topic for topic in way if topic in depth) for way in ways)
@@ -151,7 +151,7 @@ class DepthBag(Bag):
                          f'compressedDepth do: choose another bag (this one has {self._topics()})')
 
     def _carries_depth(self, connection: Connection) -> bool:
-        if connection.topic.endswith(f'/{CROP}'):  # recorded with all that the node publishes
+        if connection.topic.endswith(f'/{CROP}'):  # in a recording of all topics of the node
             return False
         if connection.msgtype not in (IMAGE, COMPRESSED_IMAGE) or (message := self.first(connection)) is None:
             return False
@@ -172,10 +172,10 @@ class DepthBag(Bag):
 
 @dataclass(frozen=True)
 class RecordedHands:
-    """The hands of one image, as a bag tells them.
+    """The hands of one image, as they were recorded.
 
     Attributes:
-        stamp_ns: of the header, which is that of the depth image.
+        stamp_ns: of the header; this is the stamp of the depth image.
         frame_id: of the header.
         skeleton: name of the joint set.
         joints: (hands, J, 3) float64, metres.
@@ -199,11 +199,11 @@ def read_hands(path: str | os.PathLike[str], topic: str | None = None, *, partly
     """All HandJointsArray messages of a bag, in the order of recording.
 
     Args:
-        topic: by default the only one of this type.
-        partly: of a damaged bag those before the damage.
+        topic: by default the only topic of this type.
+        partly: if the bag is damaged, return the messages before the damage, unless there are none.
 
     Raises:
-        InputError: no such topic, several to choose from, or a damaged bag.
+        InputError: there is no such topic, there are several to choose from, or the bag is damaged.
     """
     with Bag(path) as bag:
         hands = [c for c in bag.connections if c.msgtype == HANDS]
@@ -224,7 +224,7 @@ def read_hands(path: str | os.PathLike[str], topic: str | None = None, *, partly
 
 
 def check_frame(source: str, hands: str, images: str) -> None:
-    """Raise InputError if hands are told in another frame than their images are; a frame without a name may be any."""
+    """Raise InputError if hands and images are in different frames. A frame without a name may be any frame."""
     if hands and images and hands != images:
         raise InputError(f"{source}: its joints are in frame '{hands}', but the images in '{images}': leave the "
                          'target_frame of the node empty, and it publishes them where the camera sees them')

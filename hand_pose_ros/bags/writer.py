@@ -1,4 +1,4 @@
-"""Depth images, hands and other messages into a new ROS 2 bag."""
+"""Write depth images, hands and other messages to a new ROS 2 bag."""
 
 from __future__ import annotations
 
@@ -36,20 +36,21 @@ from hand_pose_ros.markers import Marker
 from hand_pose_ros.skeleton import HAND21, Skeleton
 
 MARKERS = 'visualization_msgs/msg/MarkerArray'
-_FOREVER = QosTime(2147483647, 4294967295)  # what rosbag2 writes for "no limit"
+_FOREVER = QosTime(2147483647, 4294967295)  # rosbag2 writes this for "no limit"
 
 
 class BagWriter:
-    """Writes a bag that appears at `path` when it is complete: `with BagWriter(path) as bag: ...`.
+    """Writes a bag: `with BagWriter(path) as bag: ...`. The bag appears at `path` when it is complete.
 
-    After an error nothing is left at `path`, or what was there before.
+    After an error, `path` is as it was before.
 
     Args:
-        path: a single file if it ends in .mcap or .db3, else the folder of a ROS 2 bag, which must not exist yet.
+        path: if it ends in .mcap or .db3, a single file; an existing file is replaced. Otherwise the folder of a ROS 2
+            bag, which must not exist yet.
         storage: 'mcap' or 'sqlite3', for a folder.
 
     Raises:
-        InputError: the folder exists already, or cannot be written, or there is no such storage.
+        InputError: the folder exists already, the bag cannot be written, or the storage is unknown.
     """
 
     def __init__(self, path: str | os.PathLike[str], storage: str = 'mcap') -> None:
@@ -61,7 +62,7 @@ class BagWriter:
             raise InputError(f"{self.path}: unknown storage '{storage}': choose mcap or sqlite3")
         if self.path.exists() and not (self._is_file and self.path.is_file()):
             raise InputError(f'{self.path}: there is something already: give another name for the bag, or remove it')
-        self._target = Path(os.path.realpath(self.path))  # a link stays one
+        self._target = Path(os.path.realpath(self.path))  # a link stays a link
         try:
             self._target.parent.mkdir(parents=True, exist_ok=True)
             self._work = Path(tempfile.mkdtemp(prefix=f'.{self.path.name}.', dir=self._target.parent))
@@ -80,17 +81,20 @@ class BagWriter:
         self._types = typestore().types
 
     def write(self, topic: str, msgtype: str, message: Any, stamp_ns: int, *, latched: bool = False) -> None:
-        """Write a message made of the types of rosbags (`hand_pose_ros.bags.bag.typestore().types`)."""
+        """Write a message that is made of the types of rosbags (`hand_pose_ros.bags.bag.typestore().types`).
+
+        The other arguments are those of `write_serialized`.
+        """
         self.write_serialized(topic, msgtype, typestore().serialize_cdr(message, msgtype), stamp_ns, latched=latched)
 
     def write_serialized(self, topic: str, msgtype: str, data: bytes | memoryview, stamp_ns: int, *,
                          latched: bool = False) -> None:
-        """Write CDR bytes, such as those of rclpy.serialization.serialize_message.
+        """Write CDR bytes, for example those of rclpy.serialization.serialize_message.
 
         Args:
-            msgtype: such as 'sensor_msgs/msg/Image'.
+            msgtype: for example 'sensor_msgs/msg/Image'.
             stamp_ns: time of recording.
-            latched: players offer the topic as transient local.
+            latched: bag players offer the topic as transient local.
         """
         with naming_full_disk(self.path):
             self._write(topic, msgtype, data, stamp_ns, latched)
@@ -106,10 +110,10 @@ class BagWriter:
 
     def write_depth(self, stamp_ns: int, frame_id: str, depth: NDArray[np.float32], intrinsics: Intrinsics, *,
                     topic: str = '/depth/image_rect', codec: str | None = 'png') -> None:
-        """Write a depth image as 16UC1, in millimetres, and its camera_info beside it.
+        """Write a depth image as 16UC1, in millimetres, and its camera_info on the topic beside it.
 
         Args:
-            depth: (H, W) metres, 0 = no reading.
+            depth: (H, W), metres, 0 = no reading.
             topic: of the raw image; with a codec, `/compressedDepth` is added.
             codec: 'png' or 'rvl' for compressedDepth, None for raw images.
         """
@@ -129,7 +133,10 @@ class BagWriter:
 
     def write_hands(self, stamp_ns: int, frame_id: str, hands: Sequence[HandEstimate], skeleton: Skeleton = HAND21,
                     topic: str = '/hand/joints', *, recorded_ns: int | None = None) -> None:
-        """Write a HandJointsArray: all hands of one image, none included; `recorded_ns` is its time, if not the stamp.
+        """Write a HandJointsArray: all hands of one image, even if there are none.
+
+        Args:
+            recorded_ns: time of recording, if it is not the stamp.
         """
         self.write(topic, HANDS, self._types[HANDS](
             header=self._header(stamp_ns, frame_id), skeleton=skeleton.name,
@@ -137,7 +144,7 @@ class BagWriter:
 
     def write_skeleton(self, stamp_ns: int, frame_id: str, skeleton: Skeleton, model: str, model_version: str, *,
                        recorded_ns: int | None = None) -> None:
-        """Write what the joints mean (HandSkeleton) on /hand/skeleton, latched; once."""
+        """Write what the joints mean (HandSkeleton) on /hand/skeleton, latched. Call this once."""
         self.write('/hand/skeleton', SKELETON, self._types[SKELETON](
             header=self._header(stamp_ns, frame_id), name=skeleton.name, joint_names=list(skeleton.joint_names),
             parents=np.array(skeleton.parents, np.int8), model=model, model_version=model_version),
@@ -145,14 +152,14 @@ class BagWriter:
 
     def write_markers(self, stamp_ns: int, frame_id: str, markers: Sequence[Marker], *,
                       recorded_ns: int | None = None) -> None:
-        """Write a MarkerArray on /hand/markers (see `hand_pose_ros.markers`); players show it until it is deleted."""
+        """Write a MarkerArray on /hand/markers (see `hand_pose_ros.markers`). Viewers show it until it is deleted."""
         header = self._header(stamp_ns, frame_id)
         message = self._types[MARKERS](markers=[self._marker(header, marker) for marker in markers])
         self.write('/hand/markers', MARKERS, message, stamp_ns if recorded_ns is None else recorded_ns)
 
     def close(self) -> None:
-        """Complete the bag and move it into place."""
-        if not self._work.exists():  # it was closed or given up before
+        """Complete the bag and move it to its path."""
+        if not self._work.exists():  # it was closed or aborted before
             return
         made = self._writer.path
         try:
@@ -163,8 +170,8 @@ class BagWriter:
             shutil.rmtree(self._work, ignore_errors=True)
 
     def abort(self) -> None:
-        """Give the bag up and leave nothing."""
-        with suppress(Exception):  # a full disk, of which has been told
+        """Abort the bag and leave nothing."""
+        with suppress(Exception):  # for example a full disk, which has been reported
             self._writer.abort()
         shutil.rmtree(self._work, ignore_errors=True)
 

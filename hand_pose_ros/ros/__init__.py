@@ -1,4 +1,4 @@
-"""The ROS 2 side: the only room that imports rclpy or messages."""
+"""The ROS 2 side. Only this package imports rclpy or messages."""
 
 import re
 from typing import Any
@@ -20,15 +20,15 @@ except ImportError as error:
 
 
 def init(args: list[str] | None = None, **options: Any) -> None:
-    """rclpy.init, whose arguments may be wrong.
+    """Call rclpy.init, and explain its errors.
 
     Raises:
-        HandPoseError: the arguments of ROS cannot be used, or its log cannot be written.
+        HandPoseError: the ROS arguments cannot be used, or ROS cannot write its log.
     """
     try:
         rclpy.init(args=args, **options)
-    except RuntimeError as error:  # RCLError, which rclpy keeps to itself
-        reason = re.sub(r', at /\S+:\d+', '', str(error).splitlines()[0])  # of the file in C
+    except RuntimeError as error:  # RCLError, which rclpy does not export
+        reason = re.sub(r', at /\S+:\d+', '', str(error).splitlines()[0])  # the file and line in C
         if 'log directory' in reason:
             raise HandPoseError(f'ROS cannot write its log ({reason}): set the environment variable ROS_LOG_DIR to a '
                                 'folder that can be written') from error

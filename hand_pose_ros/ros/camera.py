@@ -12,21 +12,21 @@ from hand_pose_ros.ros.params import Params
 
 
 class Closed(Exception):
-    """The waiting for a camera_info was ended."""
+    """Raised when waiting for a camera_info is ended."""
 
 
 class Camera:
     """Intrinsics from parameters or from the newest camera_info.
 
-    Images and camera_info are not synchronised: an exact match of stamps would wait for drivers that publish the info
-    once, or late, or with another stamp. The newest one that has the size of the image is taken instead.
+    Images and camera_info are not synchronised by their stamps: some drivers publish the camera_info once, or late, or
+    with another stamp. Instead, the newest camera_info is used. It must have the size of the image.
 
     Args:
         topic: of the camera_info.
-        remedy: what else may be done where there is none.
+        remedy: what else the user can do if there is no camera_info; for the error message.
 
     Attributes:
-        waiting: whether an image waits for its camera_info just now.
+        waiting: whether an image is waiting for its camera_info at this moment.
     """
 
     def __init__(self, topic: str, remedy: str = 'set the parameters intrinsics.fx, .fy, .cx and .cy') -> None:
@@ -42,7 +42,7 @@ class Camera:
             self._changed.notify_all()
 
     def open(self) -> None:
-        """Wait again where one is missing. What arrived before still holds: some drivers publish it only once."""
+        """Wait again if there is no camera_info. An earlier one is still used: some drivers publish it only once."""
         self._closed = False
 
     def close(self) -> None:
@@ -52,11 +52,12 @@ class Camera:
             self._changed.notify_all()
 
     def intrinsics(self, width: int, height: int, params: Params) -> Intrinsics:
-        """For an image of this size; waits a moment for a camera_info that is late.
+        """The intrinsics for an image of this size. Waits up to `camera_info_timeout` for a camera_info that is late.
 
         Raises:
-            InputError: there is none, it is not calibrated, it describes an image of another size, or no lens is so.
-            Closed: before there was one.
+            InputError: there is no camera_info, it is not calibrated, it is for another image size, no lens can have
+                these intrinsics, or only some of the parameters intrinsics.* are set.
+            Closed: the waiting was ended before a camera_info arrived.
         """
         if params.has_intrinsics:
             given = params.intrinsics_fx, params.intrinsics_fy, params.intrinsics_cx, params.intrinsics_cy
@@ -84,13 +85,16 @@ class Camera:
         return intrinsics
 
     def source(self, params: Params) -> str:
-        """Where the intrinsics come from."""
+        """Where the intrinsics come from, in words."""
         if params.has_intrinsics:
             return 'parameters'
         return self.topic if self._info is not None else f'none yet on {self.topic}'
 
     def frame_problem(self, frame_id: str, params: Params) -> str:
-        """What is suspicious about the frame of an image, empty if nothing: another camera may have the same size."""
+        """What is suspicious about the frame of an image; empty if nothing is.
+
+        The camera_info may be that of another camera whose images have the same size.
+        """
         info = self._info
         if params.has_intrinsics or info is None or info.header.frame_id in ('', frame_id):
             return ''

@@ -1,4 +1,4 @@
-"""Hand estimates to messages and back. Pure functions; numpy becomes plain Python, because messages check types."""
+"""Hand estimates to messages and back. Pure functions. numpy becomes plain Python, because messages check types."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _SIDE_NAMES = {number: side for side, number in SIDES.items()}
 
 
 def hands_to_msg(header: Header, hands: Sequence[HandEstimate], skeleton: Skeleton) -> HandJointsArray:
-    """All hands of one image; `header` is that of the image, and is copied as it is."""
+    """All hands of one image. `header` is the header of the image, and is copied unchanged."""
     return HandJointsArray(header=header, skeleton=skeleton.name, hands=[hand_to_msg(hand) for hand in hands])
 
 
@@ -46,7 +46,7 @@ def hand_from_msg(message: HandJoints, skeleton: Skeleton) -> HandEstimate:
     """The inverse of `hand_to_msg`.
 
     Raises:
-        InputError: it has not the joints of the skeleton, or its cube is none.
+        InputError: the number of joints is not that of the skeleton, or the cube is not in front of the camera.
     """
     joints, confidences = len(message.joints), len(message.confidence)
     if not joints == confidences == len(skeleton):
@@ -61,7 +61,7 @@ def hand_from_msg(message: HandJoints, skeleton: Skeleton) -> HandEstimate:
 
 
 def skeleton_to_msg(header: Header, skeleton: Skeleton, model: str, model_version: str) -> HandSkeleton:
-    """What the joints mean; published once, latched."""
+    """What the joints mean."""
     return HandSkeleton(header=header, name=skeleton.name, joint_names=list(skeleton.joint_names),
                         parents=array('b', skeleton.parents), model=model, model_version=model_version)
 
@@ -70,7 +70,7 @@ def markers_to_msg(header: Header, markers: Sequence[HandMarker], lifetime_s: fl
     """The markers of an image.
 
     Args:
-        lifetime_s: after how long without news a viewer removes a marker by itself; 0 = never.
+        lifetime_s: seconds without news after which a viewer removes a marker by itself; 0 = never.
     """
     lifetime = Duration(seconds=lifetime_s).to_msg()
     messages = []
@@ -84,7 +84,7 @@ def markers_to_msg(header: Header, markers: Sequence[HandMarker], lifetime_s: fl
 
 
 def in_frame(hands: HandJointsArray, transform: TransformStamped) -> HandJointsArray:
-    """The same hands, in metres in the frame that the transform leads to; the stamp stays."""
+    """The same hands, in metres, in the target frame of the transform. The stamp stays the same."""
     t, q = transform.transform.translation, transform.transform.rotation
     rotation = Rotation.from_quat((q.x, q.y, q.z, q.w))
 
@@ -99,13 +99,12 @@ def in_frame(hands: HandJointsArray, transform: TransformStamped) -> HandJointsA
 
 
 def poses_to_msg(hands: HandJointsArray) -> PoseArray:
-    """The joints of all hands, one hand after the other, as poses that are not turned; for who lacks our messages."""
+    """The joints of all hands, one hand after the other, as poses without rotation. For tools without our messages."""
     return PoseArray(header=hands.header, poses=[Pose(position=joint) for hand in hands.hands for joint in hand.joints])
 
 
 def prefixes(hands: Sequence[HandEstimate]) -> list[str]:
-    """What the names of the joints of each hand begin with: l_ or r_, and its id if there is another hand of that side.
-    """
+    """Prefixes for the joint names of each hand: l_ or r_. If that is taken or the side is unknown, the id and _."""
     names: list[str] = []
     for hand in hands:
         prefix = {'left': 'l_', 'right': 'r_'}.get(hand.side, '')
@@ -114,9 +113,9 @@ def prefixes(hands: Sequence[HandEstimate]) -> list[str]:
 
 
 def joint_states_to_msg(header: Header, hands: Sequence[HandEstimate]) -> JointState:
-    """The angles of the fingers (see `hand_pose_ros.angles`) in radians, e.g. of r_index_mcp_flexion.
+    """The finger angles (see `hand_pose_ros.angles`) in radians, for example of r_index_mcp_flexion.
 
-    Hands whose side is unknown have none, as one side flexes where the other extends.
+    Hands of unknown side are left out, because what is flexion on one side is extension on the other.
     """
     told = [(prefix, hand) for prefix, hand in zip(prefixes(hands), hands, strict=True) if hand.side != 'unknown']
     return JointState(
@@ -125,9 +124,9 @@ def joint_states_to_msg(header: Header, hands: Sequence[HandEstimate]) -> JointS
 
 
 def transforms_to_msgs(header: Header, hands: Sequence[HandEstimate], namespace: str = '/') -> list[TransformStamped]:
-    """A frame for each joint, e.g. r_index_tip, as a child of the frame of the image, and not turned against it.
+    """A frame for each joint, for example r_index_tip: a child of the frame of the image, without rotation.
 
-    With the namespace of the node, such as /left, it is left/r_index_tip: all nodes publish on one /tf.
+    If the node has a namespace, for example /left, the name is left/r_index_tip, because all nodes share one /tf.
     """
     messages, above = [], f'{namespace.strip("/")}/'.lstrip('/')
     for prefix, hand in zip(prefixes(hands), hands, strict=True):
@@ -139,7 +138,7 @@ def transforms_to_msgs(header: Header, hands: Sequence[HandEstimate], namespace:
 
 
 def patch_to_msg(header: Header, patch: NDArray[np.float32]) -> Image:
-    """What a network sees, (1, H, W) in [-1, 1], as a 32FC1 image: -1 is the front of the cube, 1 its back or nothing.
+    """What a network sees, (1, H, W) in [-1, 1], as a 32FC1 image. -1 is the front of the cube, 1 the back or nothing.
     """
     _, height, width = patch.shape
     return Image(header=header, height=height, width=width, encoding='32FC1', step=4 * width,

@@ -1,4 +1,4 @@
-"""What happened to the images of the last second, as one status of /diagnostics (REP-107)."""
+"""What happened to the images of the last second, as one status for /diagnostics (REP-107)."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from hand_pose_ros.ros.topics import remedy_for_lost_images
 
 MAX_DROPPED = 0.2
-"""A larger share of dropped or lost images is worth a warning."""
+"""If a larger share of images is dropped or lost, there is a warning."""
 MIN_SAMPLE = 10
-"""Fewer than this tell nothing about shares."""
+"""Shares of fewer images than this mean nothing."""
 REPEAT_S = 30.0
-"""The same complaint is logged again after so long."""
+"""The same complaint is logged again after this time."""
 MAX_AGE_S = 10.0
-"""Older images come from a bag, not from a camera: their age says nothing."""
+"""Images older than this come from a bag, not from a camera, so their age means nothing."""
 MAX_KINDS = 100
-"""So many different complaints are remembered."""
+"""Maximum number of different complaints that are remembered."""
 
 
 @dataclass
@@ -36,13 +36,13 @@ class _Window:
 
 
 class Statistics:
-    """Counts (received, dropped, refused, answered; camera_infos, hands) and times; for use from several threads.
+    """Counts (received, dropped, waited, refused, answered; camera_infos, hands) and times. Several threads may use it.
 
-    Those `waited` are of the dropped ones, overtaken while another waited for its camera_info.
+    `waited` counts the dropped images that were overtaken while another image waited for its camera_info.
 
     Attributes:
-        failure: why the node could not do as it was told, empty if it could.
-        silence: why images stay away, empty if they do not.
+        failure: why a lifecycle transition failed; empty if none did.
+        silence: why no images arrive; empty if they do.
     """
 
     def __init__(self) -> None:
@@ -55,19 +55,19 @@ class Statistics:
         self._logged_at: dict[str, float] = {}
 
     def count(self, **counts: int) -> None:
-        """Add to the counts that are named."""
+        """Add to the named counts."""
         with self._lock:
             self._window.counts.update(counts)
             self._totals.update(counts)
 
     def time(self, **seconds: float) -> None:
-        """Add a time to each of the stages that are named."""
+        """Add a time in seconds to each of the named stages."""
         with self._lock:
             for stage, value in seconds.items():
                 self._window.seconds[stage].append(value)
 
     def age(self, nanoseconds: int) -> None:
-        """Add the time from the stamp of an image to its answer, unless the two clocks are not the same one."""
+        """Add the time from the stamp of an image to its answer. Ignored if the two clocks differ."""
         if 0 <= nanoseconds < MAX_AGE_S * 1e9:
             self.time(age=nanoseconds / 1e9)
 
@@ -77,7 +77,7 @@ class Statistics:
             self._window.problem = text
 
     def is_news(self, problem: str) -> bool:
-        """Whether a problem should be logged: once, and again after a while; numbers do not make it another problem."""
+        """Whether to log a problem: once, and again after REPEAT_S. Other numbers in it make no new problem."""
         kind, now = re.sub(r'\d+', '#', problem), time.monotonic()
         with self._lock:
             if now - self._logged_at.get(kind, -REPEAT_S) < REPEAT_S:
@@ -88,12 +88,12 @@ class Statistics:
             return True
 
     def report(self, node: str, state: str, published: bool, facts: dict[str, str]) -> DiagnosticStatus:
-        """The status of the time since the last report, which begins a new one.
+        """The status for the time since the last report. This starts a new period.
 
         Args:
             node: its name.
-            state: of the lifecycle, e.g. `active`.
-            published: whether the topic of the images has a publisher; without one, none can be lost on the way.
+            state: of the node, for example `active`.
+            published: whether the image topic has a publisher. Without one, no images can be lost on the way.
             facts: more keys and values.
         """
         with self._lock:
@@ -116,7 +116,7 @@ class Statistics:
                                 values=[KeyValue(key=key, value=value) for key, value in values.items()])
 
     def _count_arrivals(self, counts: Counter[str]) -> None:
-        """What arrived in one window or, of slow cameras, in several."""
+        """Count what arrived in one window, or in several windows if the camera is slow."""
         if not counts['camera_infos']:
             self._arriving, self._arrived = Counter(), Counter()
         self._arriving.update({what: counts[what] for what in ('camera_infos', 'received')})
@@ -125,20 +125,20 @@ class Statistics:
 
 
 def _judge(window: _Window, state: str, arrived: Counter[str], silence: str) -> tuple[bytes, str]:
-    """Level and message: the worst that happened."""
+    """Level and message of the worst problem."""
     counts = window.counts
     if window.problem:
         return DiagnosticStatus.WARN, window.problem
     if state != 'active':
         return DiagnosticStatus.OK, f'the node is {state}'
-    if silence:  # which knows more than that images are missing
+    if silence:  # it says more than that images are missing
         return DiagnosticStatus.STALE, silence
     if arrived['received'] < (1 - MAX_DROPPED) * arrived['camera_infos']:
         return DiagnosticStatus.WARN, (f'{arrived["camera_infos"]} camera_info but only {arrived["received"]} images '
                                        f'arrived: if there should be as many, {remedy_for_lost_images()}')
     if counts['received'] == 0:
         return DiagnosticStatus.STALE, 'no images'
-    # That images wait for their camera_info is said in its time.
+    # Images that wait for their camera_info are reported elsewhere.
     too_many = counts['dropped'] - counts['waited'] > MAX_DROPPED * counts['received']
     if counts['received'] >= MIN_SAMPLE and too_many:
         return DiagnosticStatus.WARN, (f'{counts["dropped"]} of {counts["received"]} images of a second were dropped: '

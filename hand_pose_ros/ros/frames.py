@@ -1,4 +1,4 @@
-"""tf, which is not everywhere: ROS from wheels has neither tf2_ros nor tf2_msgs, so they are imported when needed."""
+"""tf. ROS from wheels has neither tf2_ros nor tf2_msgs, so they are imported only when they are needed."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from std_msgs.msg import Header
 from hand_pose_ros.errors import HandPoseError, InputError
 
 TIMEOUT_S = 0.1
-"""An image waits so long for the transform of its time."""
+"""Maximum time that an image waits for the transform at its stamp."""
 
 
 def tf_message() -> type:
-    """The type of /tf.
+    """The message type of /tf.
 
     Raises:
         HandPoseError: tf2_msgs is not installed.
@@ -31,7 +31,7 @@ def tf_message() -> type:
 
 
 class TargetFrame:
-    """Where the camera is in another frame.
+    """Knows where the camera is in the target frame.
 
     Raises:
         HandPoseError: tf2_ros is not installed.
@@ -49,10 +49,10 @@ class TargetFrame:
         self._listener: Any = tf2_ros.TransformListener(self._buffer, node)
 
     def lookup(self, header: Header) -> TransformStamped:
-        """From the frame of an image to the target frame, at the time of the image.
+        """The transform from the frame of an image to the target frame, at the time of the image.
 
         Raises:
-            InputError: it is not known.
+            InputError: the transform is not known.
         """
         try:
             return self._buffer.lookup_transform(self._frame, header.frame_id, Time.from_msg(header.stamp),
@@ -62,7 +62,7 @@ class TargetFrame:
                              f'known ({error}): publish the transform, or leave target_frame empty') from error
 
     def clear(self) -> None:
-        """Forget moving transforms: time went back, and tf ignores what is older than what it has."""
+        """Forget moving transforms. Call this when time goes back: tf ignores transforms older than those it has."""
         self._buffer.clear()
 
     def close(self) -> None:

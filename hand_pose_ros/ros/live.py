@@ -1,4 +1,4 @@
-"""Play a bag through the real node, in a process of its own and over DDS, and record what it answers and when."""
+"""Play a bag through the real node, in its own process and over DDS. Record what the node answers, and when."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ from hand_pose_ros.ros.replay import Replay
 from hand_pose_ros.ros.topics import CAMERA_INFO, IMAGE
 
 START_TIMEOUT_S = 60.0
-"""The node must be up after so long; loading the network takes most of it."""
+"""Maximum time for the node to start. Loading the network takes most of it."""
 QUIET_S = 2.0
-"""An answer that has not come so long after the last one will not come."""
+"""If no answer comes for this time after the last one, none will come."""
 
 
 @dataclass(frozen=True)
 class Answers:
-    """What the node said. Images and answers belong together by their stamp in ns.
+    """The answers of the node. An image and its answer have the same stamp, in ns.
 
     Attributes:
         skeleton: name of the joint set.
         hands: stamp -> the answer.
-        latency_s: stamp -> from the arrival of the image at a subscriber to that of the answer at the same one.
+        latency_s: stamp -> seconds from the arrival of the image to the arrival of the answer, at the same subscriber.
     """
 
     skeleton: str
@@ -54,18 +54,18 @@ class Answers:
 
 def play_through_node(bag: DepthBag, camera_info_topic: str | None = None,
                       parameters: Mapping[str, Any] | None = None, patient: bool = False) -> Answers:
-    """Start the node `estimator` in a namespace of its own, play the depth images at their pace, and stop the node.
+    """Start the node `estimator` in its own namespace, play the depth images at their recorded pace, and stop the node.
 
     Args:
-        camera_info_topic: if it is not beside the depth topic.
+        camera_info_topic: needed if it is not beside the depth topic.
         parameters: of the node.
-        patient: wait for each answer before the next image, so that a machine that is too slow, or busy with something
-            else, plays slower; otherwise the node drops images, as it would those of a camera.
+        patient: wait for each answer before the next image. So a machine that is too slow or busy plays slower. Without
+            this, the node drops images, as it does with a camera.
 
-    A damaged bag is played as far as it goes.
+    A damaged bag is played as far as possible.
 
     Raises:
-        HandPoseError: the node does not come up, or dies.
+        HandPoseError: the node does not start, or dies.
         InputError: the bag cannot be played, or two of its images have the same stamp.
     """
     stamps: Counter[int] = Counter()
@@ -80,12 +80,12 @@ def play_through_node(bag: DepthBag, camera_info_topic: str | None = None,
     info = camera_info_topic or camera_info_beside(image)
     infos = {info} & {connection.topic for connection in bag.connections}
     arguments = [item for name, value in {'transport': transport, **(parameters or {})}.items()
-                 for item in ('-p', f'{name}:={json.dumps(value)}')]  # YAML, in which 'a: b' must be quoted
+                 for item in ('-p', f'{name}:={json.dumps(value)}')]  # ROS reads YAML, in which 'a: b' must be quoted
     remappings = {'__ns': namespace, '/diagnostics': f'{namespace}/diagnostics', IMAGE: image, CAMERA_INFO: info}
     arguments += [item for name, topic in remappings.items() for item in ('-r', f'{name}:={topic}')]
     if ours := not rclpy.ok():
         qos.let_large_images_through()
-        init(signal_handler_options=SignalHandlerOptions.NO)  # with rclpy's, Ctrl-C ends the listener in a traceback
+        init(signal_handler_options=SignalHandlerOptions.NO)  # else Ctrl-C ends the listener with a traceback
     try:
         with _listening(namespace, bag.depth_topic, Image if transport == 'raw' else CompressedImage) as listener, \
                 _running(arguments) as process:
@@ -104,7 +104,7 @@ def play_through_node(bag: DepthBag, camera_info_topic: str | None = None,
                 except InputError:
                     if not replay.published[bag.depth_topic]:
                         raise
-                listener.wait_until_quiet()  # the last image goes with its publisher, if it is still on the way
+                listener.wait_until_quiet()  # an image still on the way is lost when its publisher is closed
             finally:
                 replay.close()
             if process.poll() is not None:
@@ -125,7 +125,7 @@ class _Listener:
         self.skeleton = self.failure = ''
         self.seen: dict[int, float] = {}
         self.answers: dict[int, tuple[float, HandJointsArray]] = {}
-        # Serialized, for unpacking large images here would slow down what is measured.
+        # Serialized, because unpacking large images here would slow down what is measured.
         self.node.create_subscription(image_type, depth_topic, self._on_image, QoSProfile(depth=10), raw=True)
         self.node.create_subscription(HandJointsArray, 'hand/joints', self._on_answer, QoSProfile(depth=100))
         self.node.create_subscription(HandSkeleton, 'hand/skeleton', self._on_skeleton, qos.LATCHED)
@@ -140,7 +140,7 @@ class _Listener:
             time.sleep(0.05)
 
     def _on_image(self, data: bytes) -> None:
-        # A header, which begins with its stamp, is the first field behind the 4 bytes that tell the byte order.
+        # The first 4 bytes give the byte order. The header follows, and begins with the stamp.
         sec, nanosec = struct.unpack_from('<iI' if data[1] & 1 else '>iI', data, 4)
         self.seen.setdefault(sec * 1_000_000_000 + nanosec, time.monotonic())
 
@@ -170,7 +170,7 @@ def _listening(namespace: str, depth_topic: str, image_type: type) -> Iterator[_
 
 @contextmanager
 def _running(arguments: list[str]) -> Iterator[subprocess.Popen[bytes]]:
-    """The node in another process, which is stopped as Ctrl-C does."""
+    """Run the node in another process. At the end, stop it as Ctrl-C does."""
     code = 'import sys; from hand_pose_ros.cli import main; sys.exit(main())'
     process = subprocess.Popen([sys.executable, '-c', code, 'estimator', '--ros-args', *arguments])
     try:

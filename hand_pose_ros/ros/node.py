@@ -1,6 +1,7 @@
 """The node `estimator`: depth images in, hand joints out.
 
-Callbacks only store and signal. One worker thread takes the newest image through decode, estimate and publish.
+Callbacks only store data and signal. One worker thread takes the newest image, decodes it, estimates the hands and
+publishes them.
 """
 
 from __future__ import annotations
@@ -44,16 +45,16 @@ from hand_pose_ros.ros.worker import NewestWorker
 
 _Transition = Callable[['EstimatorNode', LifecycleState], TransitionCallbackReturn]
 QOS = 'qos_overrides.'
-"""Parameters whose names begin so are declared when their topic is listened to."""
+"""Parameters with this prefix are declared when the node subscribes to their topic."""
 SILENCE_S = 5.0
-"""Images that stay away for so long are worth a warning."""
+"""If no image arrives for this time, there is a warning."""
 BACK_NS = 100_000_000
-"""An image that is older than the one before by more than this is of a bag that began again; clocks are corrected, and
-images overtake each other, by less."""
+"""If an image is older than the one before it by more than this, a bag has started again. When clocks are corrected, or
+images overtake each other, it is less."""
 
 
 def _logged(transition: _Transition) -> _Transition:
-    """Say why a transition failed: rclpy itself swallows exceptions."""
+    """Log why a transition failed. rclpy itself swallows exceptions."""
     def wrapper(self: EstimatorNode, state: LifecycleState) -> TransitionCallbackReturn:
         self._statistics.failure = ''
         try:
@@ -62,7 +63,7 @@ def _logged(transition: _Transition) -> _Transition:
             result, self._statistics.failure = TransitionCallbackReturn.FAILURE, str(error)
         except Exception:
             result = TransitionCallbackReturn.ERROR
-            if not self.context.ok():  # Ctrl-C, which leaves nothing to be made or said
+            if not self.context.ok():  # after Ctrl-C, there is nothing to do or to log
                 return result
             self._statistics.failure = f'unexpected error, please report it:\n{traceback.format_exc()}'
         self._stop()
@@ -80,10 +81,10 @@ class EstimatorNode(LifecycleNode):
         self._worker: NewestWorker[Image | CompressedImage] | None = None
         self._inputs: list[Subscription] = []
         self._latched: Subscription | None = None  # to a camera_info that was published before the node came
-        self._published = False  # does anybody publish images?
+        self._published = False  # whether anybody publishes images
         self._info_stamp = -1  # of the newest camera_info, ns
         self._last_header = Header()  # of the image before
-        self._reset = False  # asked for; the worker, who alone touches the estimator, does it
+        self._reset = False  # a reset was requested; the worker does it, since only the worker uses the estimator
         super().__init__('estimator', **kwargs)
         self._change_state = self._service_change_state.callback
         self._service_change_state.callback = self._on_change_state
@@ -96,7 +97,7 @@ class EstimatorNode(LifecycleNode):
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', qos.RESULTS)
         self.create_service(SetBool, '~/enable', self._on_enable)
         self.create_service(Trigger, '~/reset', self._on_reset)
-        # Steady: with simulated time that stands still the node must still say so.
+        # A steady clock: if simulated time stands still, the node must still report it.
         self.create_timer(1.0, self._on_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
         if self._params.autostart:
             if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
@@ -120,7 +121,7 @@ class EstimatorNode(LifecycleNode):
 
     @_logged
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Start to listen, and tell what the joints will mean."""
+        """Start to listen, and publish what the joints mean."""
         super().on_activate(state)
         self._start()
         self._outputs.publish_skeleton()
@@ -128,28 +129,28 @@ class EstimatorNode(LifecycleNode):
 
     @_logged
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Finish the image in flight, take the hands off the screen, and stop listening."""
+        """Stop listening, finish the current image, and delete the markers."""
         self._stop()
         return super().on_deactivate(state)
 
     @_logged
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Let go of the network and its memory."""
+        """Release the network and its memory."""
         self._release()
         return super().on_cleanup(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Let go of everything, in whatever state."""
+        """Release everything, in any state."""
         self._release()
         return super().on_shutdown(state)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Back to unconfigured, from where the node can be configured again."""
+        """Go back to unconfigured. From there, the node can be configured again."""
         self._release()
         return super().on_error(state)
 
     def destroy_node(self) -> None:
-        """Stop the worker before what it publishes to is gone."""
+        """Stop the worker before its publishers are destroyed."""
         self._release()
         super().destroy_node()
 
@@ -167,7 +168,7 @@ class EstimatorNode(LifecycleNode):
         raw = self._params.transport == 'raw'
         self._image_type, self._decode = (Image, decode_image) if raw else (CompressedImage, decode_compressed)
         self._camera.open()
-        self._reset = True  # whoever is there now need not be who was there before
+        self._reset = True  # the hands that are there now may be others than before
         self._heard_at, self._statistics.silence = time.monotonic(), ''
         inputs = [(CameraInfo, self._camera.topic, self._on_camera_info),
                   (self._image_type, self._image_topic, self._on_image)]
@@ -204,7 +205,7 @@ class EstimatorNode(LifecycleNode):
         self._statistics.count(received=1, dropped=dropped, waited=int(dropped and self._camera.waiting))
 
     def _on_camera_info(self, info: CameraInfo) -> None:
-        stamp = stamp_ns(info.header)  # openni2_camera publishes each one twice, for its raw and its metric images
+        stamp = stamp_ns(info.header)  # openni2_camera publishes each one twice, for its raw and for its metric images
         self._statistics.count(camera_infos=int(stamp != self._info_stamp))
         self._info_stamp = stamp
         self._camera.update(info)
@@ -222,7 +223,7 @@ class EstimatorNode(LifecycleNode):
     def _on_change_state(self, request: ChangeState.Request, response: ChangeState.Response) -> ChangeState.Response:
         try:
             return self._change_state(request, response)
-        except RuntimeError:  # RCLError, with which rclpy up to Jazzy lets a transition out of place end the node
+        except RuntimeError:  # RCLError: with rclpy up to Jazzy, an invalid transition would end the node
             wanted = request.transition.label or request.transition.id
             self.get_logger().error(f'there is no transition {wanted} from the state {self._state}: ask for one that '
                                     f'`ros2 lifecycle list {self.get_fully_qualified_name()}` names')
@@ -248,21 +249,21 @@ class EstimatorNode(LifecycleNode):
     def _on_timer(self) -> None:
         listening = self._worker is not None
         published = listening and self.count_publishers(self._image_topic) > 0
-        if published and not self._published:  # who has just come, as a bag that is replayed, may take its time
+        if published and not self._published:  # a publisher that has just started, such as a bag, may take time
             self._heard_at, self._statistics.silence = time.monotonic(), ''
         self._published = published
         if listening and self._latched is None:
             self._latched = topics.subscribe_latched(self, CameraInfo, self._camera.topic, self._camera.update)
         if listening and time.monotonic() - self._heard_at > SILENCE_S:
             silence = topics.explain_silence(self, self._image_topic, self._image_type, SILENCE_S)
-            if silence != self._statistics.silence:  # who publishes what may change meanwhile, and the remedy with it
+            if silence != self._statistics.silence:  # the publishers may have changed, and so has the remedy
                 self._statistics.silence = silence
                 self._statistics.problem(silence)
             self._say(silence)
         if listening and self.count_publishers(self._outputs.joints_topic) > 1:
             self._complain(f'somebody else publishes {self._outputs.joints_topic}, too: stop one of them, or give each '
                            'a namespace (--ros-args -r __ns:=/left)')
-        name = self.get_fully_qualified_name().lstrip('/')  # nodes of other namespaces tell there, too
+        name = self.get_fully_qualified_name().lstrip('/')  # nodes of other namespaces report there, too
         status = self._statistics.report(name, self._state, published, self._facts())
         if status.level == DiagnosticStatus.WARN:
             self._say(status.message)
@@ -295,10 +296,10 @@ class EstimatorNode(LifecycleNode):
     # The worker
 
     def _answer(self, image: Image | CompressedImage) -> None:
-        """One image in, one answer out. Whatever goes wrong is said, and the next image gets its chance."""
+        """Process one image and publish the answer. An error is reported, and the next image is processed as usual."""
         try:
             start = time.perf_counter()
-            params = self._params  # of this image, whatever is set meanwhile
+            params = self._params  # for this image, even if parameters are set meanwhile
             depth = self._decode(image, params.depth_scale, source=self._image_topic)
             self._statistics.time(decode=time.perf_counter() - start)
             intrinsics = self._camera.intrinsics(depth.shape[1], depth.shape[0], params)
@@ -308,7 +309,7 @@ class EstimatorNode(LifecycleNode):
                 self._statistics.time(total=time.perf_counter() - start)
                 self._statistics.age(self.get_clock().now().nanoseconds - stamp_ns(image.header))
                 self._statistics.count(answered=1, hands=len(hands))
-            finally:  # the target frame may be unknown, but what is in that of the camera is not
+            finally:  # even if the target frame is unknown: these outputs are in the frame of the camera
                 self._outputs.publish_others(image.header, hands, depth, intrinsics, params)
         except Closed:  # the node was stopped before a camera_info came
             self._statistics.count(dropped=1)
@@ -316,7 +317,7 @@ class EstimatorNode(LifecycleNode):
             self._statistics.count(refused=1)
             self._complain(str(error))
         except Exception:
-            if self.context.ok():  # else Ctrl-C came between two steps
+            if self.context.ok():  # if not, Ctrl-C came between two steps
                 self._statistics.count(refused=1)
                 self._complain(f'unexpected error on an image, please report it:\n{traceback.format_exc()}')
 
@@ -347,10 +348,10 @@ class EstimatorNode(LifecycleNode):
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node until Ctrl-C (or SIGTERM), which is no error.
+    """Run the node until Ctrl-C or SIGTERM. Both are no error.
 
     Raises:
-        HandPoseError: a parameter at start has a wrong type or value, or the arguments of ROS are no such.
+        HandPoseError: a parameter at start has a wrong type or value, or the ROS arguments cannot be used.
     """
     ros.init(args)
     executor, node = SingleThreadedExecutor(), None

@@ -1,4 +1,4 @@
-"""All that the node publishes about hands: the joints always, the rest for those who ask for it."""
+"""All that the node publishes about hands: always the joints, and the rest on request."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Outputs:
     """The publishers of a configured node.
 
     Raises:
-        HandPoseError: a parameter asks for something that this ROS, or this model, does not have.
+        HandPoseError: a parameter needs something that this ROS, or this model, does not have.
     """
 
     def __init__(self, node: LifecycleNode, estimator: HandPoseEstimator, params: Params,
@@ -54,19 +54,19 @@ class Outputs:
 
     @property
     def joints_topic(self) -> str:
-        """The name of the joints, as others see it."""
+        """The resolved name of the topic of the joints."""
         return str(self._joints_pub.topic_name)
 
     def publish_skeleton(self) -> None:
-        """Tell what the joints will mean."""
+        """Publish what the joints mean."""
         now = Header(stamp=self._node.get_clock().now().to_msg())
         self._skeleton_pub.publish(conversions.skeleton_to_msg(now, self._skeleton, *described(self._metadata)))
 
     def publish_joints(self, header: Header, hands: Sequence[HandEstimate]) -> None:
-        """Publish what others wait for: the joints, in the target frame if there is one.
+        """Publish the joints, in the target frame if there is one. They come first, because others wait for them.
 
         Raises:
-            InputError: it is not known where the camera is in the target frame; nothing was published.
+            InputError: the transform to the target frame is not known. Nothing was published.
         """
         message = conversions.hands_to_msg(header, hands, self._skeleton)
         if self._frame is not None:
@@ -77,7 +77,7 @@ class Outputs:
 
     def publish_others(self, header: Header, hands: Sequence[HandEstimate], depth: NDArray[np.float32],
                        intrinsics: Intrinsics, params: Params) -> None:
-        """Publish all the rest, in the frame of the camera: viewers and tf know themselves where that is."""
+        """Publish all the rest, in the frame of the camera. Viewers and tf know where this frame is."""
         if self._states_pub is not None and hands:
             self._states_pub.publish(conversions.joint_states_to_msg(header, hands))
         if self._tf_pub is not None and hands:
@@ -88,7 +88,7 @@ class Outputs:
                 self._complain('the frame_id of the depth image is empty, so the joints have no place in tf: let the '
                                'camera driver set it')
         if not params.publish_markers:
-            if shown := self._markers.clear():  # it has just been switched off
+            if shown := self._markers.clear():  # markers have just been switched off
                 self._markers_pub.publish(conversions.markers_to_msg(header, shown, 0.0))
         elif self._markers_pub.get_subscription_count():
             markers = self._markers.update(hands)
@@ -97,16 +97,16 @@ class Outputs:
             self._crop_pub.publish(conversions.patch_to_msg(header, crop(depth, hands[0].cube, intrinsics)))
 
     def begin_again(self) -> None:
-        """Time went back, as when a bag is played in a loop."""
+        """Forget old transforms. Call this when time goes back, for example when a bag is played in a loop."""
         if self._frame is not None:
             self._frame.clear()
 
     def clear(self, header: Header) -> None:
-        """Take the hands off the screens."""
+        """Delete the markers of all hands."""
         self._markers_pub.publish(conversions.markers_to_msg(header, self._markers.clear(), 0.0))
 
     def close(self) -> None:
-        """Take the topics off the graph."""
+        """Destroy the publishers."""
         if self._frame is not None:
             self._frame.close()
         for publisher in self._publishers:

@@ -1,4 +1,4 @@
-"""Quality of service: what the topics ask for and offer, and how large images get through."""
+"""Quality of service of the topics, and how large images get through."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from rclpy.qos import QoSDurabilityPolicy, QoSHistoryPolicy, QoSProfile, QoSReli
 from hand_pose_ros.resources import resource
 
 RESULTS = QoSProfile(history=QoSHistoryPolicy.KEEP_LAST, depth=10, reliability=QoSReliabilityPolicy.RELIABLE)
-"""Out: reliable connects to every subscriber."""
+"""Outputs. Reliable connects to every subscriber."""
 TF = QoSProfile(history=QoSHistoryPolicy.KEEP_LAST, depth=100, reliability=QoSReliabilityPolicy.RELIABLE)
-"""Out, to /tf, as its listeners expect it."""
+"""Output to /tf, as its listeners expect it."""
 LATCHED = QoSProfile(history=QoSHistoryPolicy.KEEP_LAST, depth=1, reliability=QoSReliabilityPolicy.RELIABLE,
                      durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
-"""Out, published once: whoever comes later still receives it."""
+"""Outputs that are published once. Subscribers that come later still receive them."""
 
 
 def sensor() -> QoSProfile:
-    """In: best effort connects to every publisher, reliable or not, and only the newest image matters (REP-2003).
+    """Inputs. Best effort connects to every publisher, reliable or not. Only the newest image matters (REP-2003).
 
-    A new profile each time, because overrides by parameters are written into it.
+    Each call makes a new profile, because overrides by parameters are written into it.
     """
     return QoSProfile(history=QoSHistoryPolicy.KEEP_LAST, depth=1, reliability=QoSReliabilityPolicy.BEST_EFFORT)
 
@@ -30,15 +30,15 @@ PROFILE_VARIABLES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES
 
 
 def middleware() -> str:
-    """Name of the middleware in use, such as rmw_fastrtps_cpp; the profile is for that one alone."""
+    """Name of the middleware in use, for example rmw_fastrtps_cpp. The profile is only for this one."""
     return str(get_rmw_implementation_identifier())
 
 
 def large_image_profile() -> tuple[str, str]:
-    """The environment variable, and the file that it must name, for large images over Fast DDS.
+    """The environment variable for large images over Fast DDS, and the file that it must name.
 
-    Only who publishes images needs it: the shared memory that an image must fit into is the publisher's. Without it a
-    VGA depth image is larger than all of it, and most are lost on the way to a best-effort subscriber.
+    Only the publisher of the images needs it, because an image must fit into the shared memory of its publisher.
+    Without the profile, a VGA depth image is larger than this memory, and a best-effort subscriber loses many images.
     """
     new, old = PROFILE_VARIABLES
     name = old if os.environ.get('ROS_DISTRO') in ('humble', 'iron', 'jazzy') else new
@@ -46,6 +46,6 @@ def large_image_profile() -> tuple[str, str]:
 
 
 def let_large_images_through() -> None:
-    """Choose that profile for this process, unless the user has chosen one; call it before rclpy.init()."""
+    """Choose that profile for this process, unless the user has chosen one. Call this before rclpy.init()."""
     if not any(name in os.environ for name in PROFILE_VARIABLES):
         os.environ.update([large_image_profile()])

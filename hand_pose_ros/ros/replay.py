@@ -1,4 +1,4 @@
-"""Publishes a bag on ROS topics as it was recorded: types, stamps, order and pace."""
+"""Publishes a bag on ROS topics as it was recorded: with its types, stamps, order and pace."""
 
 from __future__ import annotations
 
@@ -29,41 +29,41 @@ from hand_pose_ros.errors import InputError
 from hand_pose_ros.ros import qos
 
 CLOCK_PERIOD_S = 0.025
-"""Between two messages on /clock."""
+"""Time between two messages on /clock."""
 SETTLE_S = 0.5
-"""What was found, or published, just now takes so long to arrive at the other side."""
+"""After a discovery, or after a message was published, the other side may need this time."""
 PATIENCE_S = 3.0
-"""A listener that is not ready is waited for so long."""
+"""Maximum waiting time for a listener that is not ready."""
 MAX_LATCHED = 1000
-"""Of the messages of a latched topic, at most this many are kept for who comes later."""
-_RENAMED = {'tf/msg/tfMessage': 'tf2_msgs/msg/TFMessage'}  # on the way from ROS 1 to ROS 2
+"""Maximum number of messages of a latched topic that are kept for subscribers that come later."""
+_RENAMED = {'tf/msg/tfMessage': 'tf2_msgs/msg/TFMessage'}  # between ROS 1 and ROS 2
 
 
 class Replay:
     """Node `replay`: one publisher for each topic of a bag, and the service `~/pause` (std_srvs/SetBool).
 
-    Serialized messages of ROS 2 bags are passed on as they are; those of ROS 1 bags are converted. Topics whose type
+    Serialized messages of ROS 2 bags are published unchanged. Messages of ROS 1 bags are converted. Topics whose type
     is not installed are left out with a warning.
 
     Args:
         bag: open for reading.
-        topics: publish these only; None takes all.
+        topics: publish only these; None = all.
         rate: how many times faster than recorded.
-        reliability: 'recorded', 'reliable' or 'best_effort'; what ROS 1 recorded counts as reliable.
-        clock: publish /clock with the time of recording, for nodes that use_sim_time.
+        reliability: 'recorded', 'reliable' or 'best_effort'. ROS 1 recordings count as reliable.
+        clock: publish /clock with the time of recording, for nodes with use_sim_time.
         paused: wait for the service before the first message.
 
     Raises:
-        InputError: one of the topics cannot be published, or none can.
+        InputError: one of the given topics cannot be published, or no topic can.
     """
 
     def __init__(self, bag: Bag, *, topics: Collection[str] | None = None, rate: float = 1.0,
                  reliability: str = 'recorded', clock: bool = False, paused: bool = False) -> None:
         self._bag, self._rate, self._paused = bag, rate, paused
         self.published: dict[str, int] = {}
-        """Number of messages on each topic."""
+        """Number of messages published so far on each topic."""
         self.lateness_s = 0.0
-        """Of the message that was published latest after its time."""
+        """The largest delay of a message after its time, so far."""
         self.node = rclpy.create_node('replay')
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
@@ -82,34 +82,36 @@ class Replay:
         self.node.create_service(SetBool, '~/pause', self._on_pause)
 
     def name(self, topic: str) -> str:
-        """What a topic of the bag is called where it is published: it may be remapped."""
+        """The name under which a topic of the bag is published. It may be remapped."""
         return str(self._outputs[topic].topic_name)
 
     def wait_for_subscribers(self, timeout_s: float, number: int | None = None) -> None:
-        """Give subscribers time to find the topics: what is published earlier never reaches them.
+        """Give subscribers time to find the topics. Messages that are published earlier never reach them.
 
         Args:
-            timeout_s: DDS participants that miss each other at first announce themselves again every 3 s.
-            number: of subscriptions to all topics together; as soon as there are so many, the waiting ends.
+            timeout_s: maximum waiting time. If DDS participants miss each other at first, they announce themselves
+                again every 3 s.
+            number: of subscriptions to all topics together. As soon as there are this many, the waiting ends.
         """
         end = time.monotonic() + timeout_s
         while (left := end - time.monotonic()) > 0:
             self._executor.spin_once(timeout_sec=min(left, 0.05))
             if number is not None and sum(o.get_subscription_count() for o in self._outputs.values()) >= number:
-                # The other side needs a moment, too, before it hears what is best effort.
+                # The other side also needs a moment, before it receives best-effort messages.
                 number, end = None, min(end, time.monotonic() + SETTLE_S)
 
     def play(self, start_s: float = 0.0, ready: Callable[[], bool] | None = None) -> None:
-        """Publish the bag once, from `start_s` seconds after its beginning; what was latched before comes first.
+        """Publish the bag once, from `start_s` seconds after its beginning. Earlier latched messages come first.
 
         Args:
-            ready: a message that is due waits until this is true; after PATIENCE_S in vain it is not asked again.
+            ready: each message waits until this returns True. If it does not within PATIENCE_S, it is not called again.
 
         Raises:
-            InputError: where the bag is damaged, after everything before the damage; or nothing was recorded so late.
+            InputError: the bag is damaged (everything before the damage is published first), or nothing was recorded
+                after start_s.
         """
         start_ns = self._bag.start_ns + round(start_s * 1e9)
-        latched = list(self._latched_before(start_ns))  # now, for a bag is not read in two places at once
+        latched = list(self._latched_before(start_ns))  # as a list, because a bag is not read in two places at once
         messages = self._bag.messages(self._connections, start=start_ns)
         first = next(messages, None)
         if first is None:
@@ -124,10 +126,10 @@ class Replay:
             self.published[connection.topic] += 1
         for output in self._outputs.values():
             output.wait_for_all_acked(Duration(seconds=1))
-        time.sleep(SETTLE_S)  # best effort is not acknowledged, and what is still on the way goes with its publisher
+        time.sleep(SETTLE_S)  # best effort is not acknowledged; messages on the way are lost when the publisher closes
 
     def close(self) -> None:
-        """Take the node and its topics off the graph."""
+        """Destroy the node and its topics."""
         self._executor.shutdown()
         self.node.destroy_node()
 
@@ -151,25 +153,25 @@ class Replay:
         self._connections.append(connection)
 
     def _latched_before(self, end_ns: int) -> Iterator[tuple[Connection, int, bytes]]:
-        """Messages on latched topics, such as /tf_static, that whoever listened at this time would have had."""
+        """Messages on latched topics, such as /tf_static, that were recorded before this time."""
         latched = [connection for connection in self._connections if _is_latched(connection)]
         if not latched or end_ns <= self._bag.start_ns:
             return
-        with suppress(InputError):  # damage on the way does not concern what comes after it
+        with suppress(InputError):  # damage in this part does not matter for what comes after it
             for message in self._bag.messages(latched):
                 if message[1] >= end_ns:
                     return
                 yield message
 
     def _to_ros2(self, connection: Connection, data: bytes) -> bytes:
-        """The message as ROS 2 serializes it."""
+        """The message, serialized for ROS 2."""
         if not self._bag.is_ros1:
             return bytes(data)
         try:
             return bytes(migrate_bytes(
                 self._bag.typestore, typestore(), connection.msgtype,
                 _RENAMED.get(connection.msgtype, connection.msgtype), self._cache, data, src_is2=False, dst_is2=True))
-        except Exception as error:  # whatever random bytes provoke
+        except Exception as error:  # random bytes can cause any error
             raise InputError(f'{self._bag.path}: a message on {connection.topic} is damaged ({error}): record or '
                              'copy the bag again') from error
 
@@ -193,7 +195,7 @@ class Replay:
                 return
 
     def _hold(self, ready: Callable[[], bool]) -> bool:
-        """Let the time of the bag stand still until the listener is ready; False if it is not in the end."""
+        """Stop the time of the bag until the listener is ready. False if it is still not ready after PATIENCE_S."""
         stopped = time.monotonic()
         while not (done := ready()) and time.monotonic() - stopped < PATIENCE_S:
             self._executor.spin_once(timeout_sec=0.002)
@@ -208,17 +210,17 @@ class Replay:
 
 @contextmanager
 def replaying(path: str | PathLike[str], ros_args: Sequence[str] = (), **options: Any) -> Iterator[Replay]:
-    """Open a bag to replay it in a ROS context of its own, in which Ctrl-C is a KeyboardInterrupt.
+    """Open a bag and initialise ROS to replay it. Ctrl-C raises KeyboardInterrupt.
 
     Args:
-        ros_args: remappings (`-r from:=to`) and so on.
-        options: of Replay.
+        ros_args: remappings (`-r from:=to`) and other ROS arguments.
+        options: the other arguments of Replay.
 
     Raises:
         InputError: the bag cannot be read, or one of the topics cannot be published.
     """
     qos.let_large_images_through()
-    # Without handlers of rclpy, Ctrl-C arrives between two messages.
+    # Without the signal handlers of rclpy, Ctrl-C arrives between two messages.
     ros.init(['--ros-args', *ros_args], signal_handler_options=SignalHandlerOptions.NO)
     try:
         with Bag(path) as bag:
@@ -239,7 +241,7 @@ def _is_latched(connection: Connection) -> bool:
 
 
 def _quality(connection: Connection, reliability: str, number: int) -> QoSProfile:
-    """What the publisher of a topic with so many messages offers: as recorded, unless a reliability is asked for."""
+    """The QoS of the publisher of a topic with `number` messages: as recorded, unless `reliability` says otherwise."""
     ext = connection.ext
     profile = QoSProfile(depth=10, reliability=QoSReliabilityPolicy.RELIABLE)
     if isinstance(ext, ConnectionExtRosbag2) and any(

@@ -1,4 +1,4 @@
-"""The topics that the node listens to, and who is at the other end when nothing arrives."""
+"""The topics that the node listens to, and why nothing may arrive on them."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ NO_REGION = ('no region arrived on {}, so no hand is looked for: publish where i
 def input_topics(node: Node, transport: str) -> tuple[str, str]:
     """Resolved names of the depth image (with its transport) and of camera_info.
 
-    A remapped image takes its camera_info along: unless that is remapped too, it is looked for beside the image, as
-    image_transport does. The compressed transports follow the name of the image as well; a name that ends in one may be
-    given, too.
+    If the image is remapped, camera_info follows it: it is expected beside the image, as in image_transport, unless it
+    is remapped itself. The topics of the compressed transports follow the image, too. The image may also be remapped to
+    a name that already ends in the transport.
     """
     image, info = node.resolve_topic_name(IMAGE), node.resolve_topic_name(CAMERA_INFO)
     if split_transport(image)[1] == transport:
@@ -44,11 +44,15 @@ def input_topics(node: Node, transport: str) -> tuple[str, str]:
 
 def subscribe(node: Node, message_type: type, topic: str, callback: Callable[..., None],
               complain: Callable[[str], None]) -> Subscription:
-    """Listen to a sensor; the user may override history, depth and reliability by the parameters
-    `qos_overrides.<topic>.subscription.*`, and hears of publishers that do not fit.
+    """Listen to a sensor.
+
+    The user may override history, depth and reliability with the parameters `qos_overrides.<topic>.subscription.*`.
+
+    Args:
+        complain: called with a message if the quality of service of a publisher does not fit.
 
     Raises:
-        HandPoseError: the user's quality of service is none.
+        HandPoseError: the parameters of the user are not a valid quality of service.
     """
     def incompatible(event: Any) -> None:
         complain(explain_incompatible(node, topic, qos_policy_name_from_kind(event.last_policy_kind).lower()))
@@ -64,10 +68,10 @@ def subscribe(node: Node, message_type: type, topic: str, callback: Callable[...
 
 
 def subscribe_latched(node: Node, message_type: type, topic: str, callback: Callable[..., None]) -> Subscription | None:
-    """Listen, too, to what was said once and is kept for whoever comes later; None if there is nobody to listen to.
+    """Also listen to latched messages, which were published once before. None if there is no latched publisher.
 
-    Only where all publishers are transient local: others would log an incompatible QoS. Should one come later, it is
-    heard all the same, by who listens without this: nothing is said of it here.
+    This needs all publishers to be transient local: any other would log an incompatible QoS. If another publisher comes
+    later, the ordinary subscription receives its messages. So there is no warning here.
     """
     infos = node.get_publishers_info_by_topic(topic)
     if not infos or any(info.qos_profile.durability != qos.LATCHED.durability for info in infos):
@@ -87,7 +91,7 @@ def describe_publishers(node: Node, topic: str) -> str:
 
 
 def _name(publisher: TopicEndpointInfo) -> str:
-    if publisher.node_name == '_NODE_NAME_UNKNOWN_':  # before its node is discovered
+    if publisher.node_name == '_NODE_NAME_UNKNOWN_':  # its node is not discovered yet
         return 'a node'
     return f'{publisher.node_namespace.rstrip("/")}/{publisher.node_name}'
 
@@ -96,8 +100,9 @@ def explain_silence(node: Node, topic: str, message_type: type, seconds: float) 
     """Why no image may have arrived for some seconds, and what to do.
 
     Args:
-        topic: resolved name.
-        message_type: what is expected there.
+        topic: resolved name of the topic.
+        message_type: the type that is expected on it.
+        seconds: how long no image has arrived.
     """
     topic_type = f'sensor_msgs/msg/{message_type.__name__}'
     said = f'no image arrived on {topic} for {seconds:.0f} s; the topic is {describe_publishers(node, topic)}'
@@ -124,12 +129,12 @@ def explain_silence(node: Node, topic: str, message_type: type, seconds: float) 
 
 
 def remedy_for_lost_images() -> str:
-    """What to do where large images do not get through."""
+    """What to do if large images do not get through."""
     return f'start the camera driver with {"=".join(qos.large_image_profile())} in its environment (Fast DDS)'
 
 
 def explain_incompatible(node: Node, topic: str, policy: str) -> str:
-    """One sentence for a publisher whose quality of service does not fit the subscription."""
+    """One sentence about a publisher whose quality of service does not fit the subscription."""
     fits = {'reliability': 'best_effort', 'durability': 'volatile'}.get(policy, '...')
     return (f'a publisher on {topic} does not offer the {policy} that was asked for, so nothing arrives from it (the '
             f'topic is {describe_publishers(node, topic)}): start this node '

@@ -1,4 +1,4 @@
-"""Listen to a camera and to the node `estimator`, and pass on what they publish, for `hand-pose view`."""
+"""Listen to a camera and to the node `estimator`, and pass on their messages, for `hand-pose view`."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ OnHands = Callable[[int, list[HandEstimate], Skeleton], None]
 
 def watch(on_depth: OnDepth, on_hands: OnHands, transport: str = 'raw', depth_scale: float = 0.001,
           intrinsics: Sequence[float] | None = None, ros_args: Sequence[str] = ()) -> None:
-    """Call back, with stamps in ns, for each depth image and for the hands of each image, until Ctrl-C.
+    """Until Ctrl-C, call `on_depth` for each depth image and `on_hands` for the hands of each image. Stamps are in ns.
 
     Args:
         transport, depth_scale: as the parameters of the node `estimator`.
-        intrinsics: fx, fy, cx and cy in pixels, instead of those of camera_info.
-        ros_args: remappings (`-r from:=to`) and so on.
+        intrinsics: fx, fy, cx and cy in pixels, used instead of camera_info.
+        ros_args: remappings (`-r from:=to`) and other ROS arguments.
     """
     ros.init(['--ros-args', *ros_args])
     try:
@@ -51,7 +51,7 @@ def watch(on_depth: OnDepth, on_hands: OnHands, transport: str = 'raw', depth_sc
 
 
 class _Watcher:
-    """Node `view`. What cannot be shown is left out with a warning."""
+    """Node `view`. Messages that cannot be shown are left out with a warning."""
 
     def __init__(self, on_depth: OnDepth, on_hands: OnHands, transport: str, depth_scale: float,
                  intrinsics: Sequence[float] | None = None) -> None:
@@ -68,7 +68,7 @@ class _Watcher:
         topics.subscribe(self._node, CameraInfo, info_topic, self._camera.update, self._complain)
         topics.subscribe(self._node, image_type, self._topic, self._image, self._complain)
         self._latched: Subscription | None = None  # to a camera_info that was published before the viewer came
-        # Steady: with simulated time that stands still it must be heard, too.
+        # A steady clock: this must also work while simulated time stands still.
         self._node.create_timer(1.0, self._listen_to_latched, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._node.create_subscription(HandJointsArray, 'hand/joints', self._hands, qos.RESULTS)
         self._hands_topic = self._node.resolve_topic_name('hand/joints')

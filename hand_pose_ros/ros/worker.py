@@ -1,4 +1,4 @@
-"""One image in flight, the newest waiting, never a queue."""
+"""One image is processed while the newest one waits. There is never a queue."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ T = TypeVar('T')
 
 
 class NewestWorker(Generic[T]):
-    """A thread that hands the newest item to `handle`; what is overtaken while it works is dropped.
+    """A thread that passes the newest item to `handle`. Older items that still wait are dropped.
 
-    A queue would only make answers late: a hand has moved on by the time an old image is looked at.
+    A queue would only make answers late: when an old image is processed, the hand has already moved on.
     """
 
     def __init__(self, handle: Callable[[T], None]) -> None:
@@ -24,14 +24,14 @@ class NewestWorker(Generic[T]):
         self._thread.start()
 
     def put(self, item: T) -> bool:
-        """Leave an item to be handled next; True if it replaced one that nobody will see."""
+        """Set the item to be handled next. True if it replaced one that was still waiting, which is dropped."""
         with self._changed:
             dropped, self._slot = self._slot is not None, item
             self._changed.notify()
         return dropped
 
     def stop(self) -> None:
-        """Finish the item in flight, forget the one that waits, and end the thread."""
+        """Finish the current item, forget the one that waits, and end the thread."""
         with self._changed:
             self._running = False
             self._changed.notify()

@@ -1,4 +1,4 @@
-"""The networks, and nothing else: one file per family, one table, checkpoints."""
+"""The networks: one file per family, one table of all architectures, and checkpoints."""
 
 from __future__ import annotations
 
@@ -31,18 +31,19 @@ ARCHITECTURES: dict[str, Callable[..., nn.Module]] = {
     'or_ref': ORRef,
 }
 REFINERS = ('std_ref', 'or_ref')
-"""Those that correct the joints of another network."""
+"""The architectures that correct the joints of another network."""
 
 
 def build(architecture: str, **config: Any) -> nn.Module:
-    """A network with fresh weights, by name; it remembers its `architecture` and its complete `config`.
+    """A network with fresh weights, by name. It remembers its `architecture` and its complete `config`.
 
-    Pose networks map patches (B, 1, 128, 128) to joints (B, J, 3) in cube units; std_ref and or_ref map patches and
-    joints to better joints; center_refiner maps patches to the palm (B, 3); hand_finder maps whole images to the
-    middles of hands.
+    - Pose networks map patches (B, 1, 128, 128) to joints (B, J, 3) in cube units.
+    - std_ref and or_ref map patches and joints to better joints.
+    - center_refiner maps patches to the palm (B, 3).
+    - hand_finder maps whole images to the middles of hands.
 
     Raises:
-        HandPoseError: no such architecture, or a value in `config` that it does not take.
+        HandPoseError: the architecture does not exist, or does not take a key or a value of `config`.
     """
     if architecture not in ARCHITECTURES:
         raise HandPoseError(f"unknown architecture '{architecture}': "
@@ -53,7 +54,7 @@ def build(architecture: str, **config: Any) -> nn.Module:
         raise HandPoseError(f"architecture '{architecture}' does not take {', '.join(unknown)}: "
                             f"it takes {', '.join(signature.parameters)}")
     arguments = signature.bind(**config)
-    arguments.apply_defaults()  # a checkpoint must not depend on the defaults of its reader
+    arguments.apply_defaults()  # a checkpoint must not depend on the defaults of the version that reads it
     try:
         network = make(**arguments.arguments)
     except (TypeError, ValueError, RuntimeError) as error:

@@ -1,4 +1,4 @@
-"""Weights on disk: one safetensors file with everything that is needed to run them. No pickles."""
+"""Weights on disk: one safetensors file with everything that is needed to run the network. No pickles."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ DEFAULT = 'hand_dense'
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A network with its refiner, in eval mode, float32, on the CPU, and what is known about them.
+    """A network and its refiner (in eval mode, float32, on the CPU), and their metadata.
 
     `metadata` holds at least architecture, config, skeleton (a name), cube_side (metres) and version.
     """
@@ -39,26 +39,26 @@ class Checkpoint:
 
 
 def available() -> dict[str, Path]:
-    """The checkpoints that ship: name -> file."""
+    """The checkpoints that ship with the package: name -> file."""
     return {path.stem: path for path in sorted(WEIGHTS.glob('*.safetensors'))}
 
 
 def save_checkpoint(path: str | Path, network: nn.Module, metadata: dict[str, Any],
                     refiner: nn.Module | None = None, half: bool = True) -> None:
-    """Write a network (and its refiner), both made by `build`, in one step that cannot leave half a file.
+    """Write a network (and its refiner), both made by `build`. The file is written in one step, never half.
 
     Args:
-        metadata: 'skeleton' and 'cube_side' [m] are needed; any further key that JSON can hold is kept.
-        half: store the trained weights as float16. Running statistics, whose range is open, stay float32.
+        metadata: must have 'skeleton' and 'cube_side' [m]. All other keys that JSON can hold are kept.
+        half: store the trained weights as float16. Running statistics stay float32, because their range is open.
 
     Raises:
-        CheckpointError: the metadata lacks a key, or a weight is not finite (or does not fit float16).
+        CheckpointError: the metadata lacks a key, or a weight is not finite (or too large for float16).
     """
     path = Path(path)
     if missing := {'skeleton', 'cube_side'} - metadata.keys():
         raise CheckpointError(f"the metadata of checkpoint {path} lacks {', '.join(sorted(missing))}")
     metadata = {**metadata, **_description(network), 'version': __version__}
-    metadata.pop('refiner', None)  # of the checkpoint that these metadata were taken from
+    metadata.pop('refiner', None)  # it belongs to the checkpoint from which these metadata were taken
     tensors = _tensors('network', network, half)
     if refiner is not None:
         metadata['refiner'] = _description(refiner)
@@ -72,10 +72,11 @@ def save_checkpoint(path: str | Path, network: nn.Module, metadata: dict[str, An
 
 
 def load_checkpoint(name_or_path: str | PathLike[str] | None = None) -> Checkpoint:
-    """A checkpoint that ships, by name (None: the default), or any other, by path.
+    """A checkpoint that ships, by name (None = the default), or any other checkpoint, by path.
 
     Raises:
-        CheckpointError: unknown name; missing, damaged or foreign file; weights that do not fit the network.
+        CheckpointError: the name is unknown; the file is missing, damaged or of another program; or the weights do not
+            fit the network.
     """
     path = _locate(DEFAULT if name_or_path is None else name_or_path)
     metadata, tensors = _read(path)
@@ -94,7 +95,7 @@ def load_checkpoint(name_or_path: str | PathLike[str] | None = None) -> Checkpoi
 
 
 def described(metadata: Mapping[str, Any]) -> tuple[str, str]:
-    """Name and version of a model, as HandSkeleton tells them."""
+    """Name and version of a model, for HandSkeleton."""
     return str(metadata.get('name', metadata['architecture'])), str(metadata['version'])
 
 
@@ -127,8 +128,8 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
             start = file.read(9)
     except OSError as error:
         raise CheckpointError(f'checkpoint {path} cannot be read ({error.strerror}): check its permissions') from error
-    # A pickle with its protocol, or a zip around one (torch.save). A safetensors file may begin with the same bytes, as
-    # it begins with a length; but then comes its header.
+    # A pickle with its protocol, or a zip with a pickle (torch.save). A safetensors file begins with a length, which
+    # may have the same bytes. But its header follows.
     if start[8:] != b'{' and re.match(rb'\x80[\x02-\x05]|PK\x03\x04', start):
         raise CheckpointError(f'{path} is a pickle, which can run code when read: give a .safetensors file')
     try:

@@ -1,8 +1,9 @@
-"""A small residual network that lets every visible piece of the hand vote for every joint; a design of ours.
+"""A small residual network in which every visible piece of the hand votes for every joint. The design is ours.
 
-The maps have 32 x 32 cells. For each joint a cell tells the direction to it and how close it is; the joint is the mean
-of the votes, weighted by closeness (the encoding of AWR, Huang et al. 2020, in cube units). With a bottleneck, the
-pose prior of the paper makes one hand of the joints; refined, each is moved by what is seen where it is now.
+The maps have 32 x 32 cells. For each joint, a cell gives the direction to the joint and how close it is. The joint is
+the mean of the votes, weighted by closeness (the encoding of AWR, Huang et al. 2020, in cube units). With a bottleneck,
+the pose prior of the paper turns the joints into one hand. With `refined`, each joint is then moved, depending on what
+is seen at its place.
 """
 
 from __future__ import annotations
@@ -20,23 +21,23 @@ from hand_pose_ros.geometry import PATCH_SIZE
 from hand_pose_ros.models.prior import PriorOverVotes, plain_linear
 
 CELLS = 32
-"""Cells along each side of the maps; one covers 4 x 4 pixels of the patch."""
+"""Cells along each side of the maps. One cell covers 4 x 4 pixels of the patch."""
 REACH = 0.8
-"""Cells further from a joint than this, in cube units, do not vote for it."""
+"""Cells that are further from a joint than this, in cube units, do not vote for it."""
 TOLD_SIZE = 0.19 / 0.30
-"""A hand of this length, over the side of its cube, has the size that is told as 0: from the wrist along the bones to
-the tip of the middle finger."""
+"""Length of the hand for which the output `size` is 0, over the side of its cube. The length is measured from the wrist
+along the bones to the tip of the middle finger."""
 SHARPNESS = 30.0
 """Weight of a vote: exp(SHARPNESS * closeness)."""
 ADDED = re.compile(r'\bstages\.\d+\.[1-9]\d*\.|\brefinement\.')
-"""Finds, in the name of a weight, what starts as the identity, so that it can be added to a trained network: a block of
-a stage behind its first, and the refinement."""
+"""Matches the names of weights that can be added to a trained network, because they start as the identity: all blocks
+of a stage but the first, and the refinement."""
 
 
 def cells(patch: Tensor) -> tuple[Tensor, Tensor]:
     """Patch (B, 1, 128, 128) -> cells (B, 3, 32, 32) in cube units, and which of them see something (B, 1, 32, 32).
 
-    The depth of a cell is the mean of its readings, 1 where there are none.
+    The depth of a cell is the mean of its readings, or 1 if it has none.
     """
     seen = (patch < 1).to(patch.dtype)
     size = PATCH_SIZE // CELLS
@@ -50,11 +51,11 @@ def cells(patch: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def encode(positions: Tensor, joints: Tensor) -> tuple[Tensor, Tensor]:
-    """What the maps should be: cells (B, 3, 32, 32) and joints (B, J, 3) -> directions and closeness.
+    """The target of the maps: cells (B, 3, 32, 32) and joints (B, J, 3) -> directions and closeness.
 
     Returns:
-        Unit vectors from cell to joint (B, J, 3, 32, 32), and closeness (B, J, 32, 32): 1 at the joint, 0 from REACH
-        on. Both are zero beyond REACH.
+        Unit vectors from cell to joint (B, J, 3, 32, 32), and closeness (B, J, 32, 32): 1 at the joint, 0 at REACH.
+        Both are zero beyond REACH.
     """
     offset = joints[..., None, None] - positions[:, None]
     distance = offset.square().sum(dim=2).sqrt()  # norm() along an inner dimension is several times as slow
@@ -63,12 +64,12 @@ def encode(positions: Tensor, joints: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def decode(positions: Tensor, seen: Tensor, directions: Tensor, closeness: Tensor) -> tuple[Tensor, Tensor]:
-    """The inverse of `encode`, differentiable: joints (B, J, 3), and the mean closeness of their votes (B, J).
+    """The differentiable inverse of `encode`: joints (B, J, 3), and the mean closeness of their votes (B, J).
 
-    Only cells that see something vote; where none does, all do.
+    Only cells that see something vote. If no cell does, all vote.
     """
     weights = (SHARPNESS * closeness.flatten(2) - 1e4 * (1 - seen.flatten(2))).softmax(dim=2)  # (B, J, 1024)
-    # The sum of weight * (cell + direction * distance) is split in two products, which never hold a map of votes.
+    # The sum of weight * (cell + direction * distance) is split in two products, so no map of votes is stored.
     base = weights @ positions.flatten(2).transpose(1, 2)  # (B, J, 3)
     distance = REACH * (1 - closeness.flatten(2))
     moved = (directions.flatten(3) @ (weights * distance)[..., None])[..., 0]  # (B, J, 3)
@@ -76,18 +77,18 @@ def decode(positions: Tensor, seen: Tensor, directions: Tensor, closeness: Tenso
 
 
 class HandDense(nn.Module):
-    """Joints, and with them what a tracker needs to know: is this a hand, which, how large, and how sure is each joint.
+    """Predicts joints, and what a tracker needs: is this a hand, its side, its size, and how sure each joint is.
 
     Args:
-        joints: J.
-        width: channels of the first stage; the cost grows with its square.
-        bottleneck: coefficients of the pose prior behind the votes; None = the votes as they are.
-        blocks: residual blocks of each stage.
+        joints: number of joints, J.
+        width: channels of the first stage. The cost grows with the square of this.
+        bottleneck: number of coefficients of the pose prior after the votes; None = no prior.
+        blocks: number of residual blocks in each stage.
         refined: whether the joints are refined.
 
     Raises:
-        HandPoseError: there are not four stages of at least one block, the width is none, or `refined` neither true nor
-            false.
+        HandPoseError: `blocks` are not four numbers of at least 1, the width is less than 1, or `refined` is neither
+            true nor false.
     """
 
     outputs = ('joints', 'confidence', 'hand', 'side', 'size')
@@ -129,28 +130,31 @@ class HandDense(nn.Module):
         return self.forward_full(patch)['joints']
 
     def forward_full(self, patch: Tensor) -> dict[str, Tensor]:
-        """(B, 1, 128, 128) in [-1, 1] -> everything that is known, by name.
+        """(B, 1, 128, 128) in [-1, 1] -> all outputs, by name.
 
-        joints (B, J, 3) in cube units; logits: confidence (B, J) that a joint is right, hand (B,) that this is one,
-        side (B,) that it is a right hand; size (B,), the logarithm of the hand's size over TOLD_SIZE of the cube's
-        side; and for the loss votes (B, J, 3), the joints before the prior, unrefined (B, J, 3), those before the
-        refinement, positions (B, 3, 32, 32), seen (B, 1, 32, 32), directions (B, J, 3, 32, 32), closeness (B, J, 32,
-        32).
+        - joints (B, J, 3) in cube units
+        - logits: confidence (B, J) that a joint is right, hand (B,) that this is a hand, side (B,) that it is a right
+          hand
+        - size (B,): log(length of the hand / (TOLD_SIZE * side of the cube))
+        - for the loss: votes (B, J, 3), the joints before the prior; unrefined (B, J, 3), the joints before the
+          refinement; positions (B, 3, 32, 32), seen (B, 1, 32, 32), directions (B, J, 3, 32, 32), closeness
+          (B, J, 32, 32)
         """
         features, fused = pyramid(self.stem(patch), self.stages, self.laterals)
         fused = self.fuse(fused)  # (B, 2w, 32, 32)
-        # Sums over a thousand cells need more than a half, and run along the cells whatever convolutions prefer.
+        # Sums over a thousand cells need more than half precision. In memory, they run along the cells, whatever layout
+        # the convolutions prefer.
         maps = self.maps(fused).float().contiguous()
         directions = maps[:, :3 * self.joints].unflatten(1, (self.joints, 3))
         closeness = maps[:, 3 * self.joints:]
         positions, seen = cells(patch.float())
-        with torch.autocast(patch.device.type, enabled=False):  # nor may training in half precision halve them
+        with torch.autocast(patch.device.type, enabled=False):  # also not when training in half precision
             votes, agreement = decode(positions, seen, directions, closeness)
         whole = features[-1].mean(dim=(2, 3))  # (B, 8w)
         summary = self.summary(torch.cat([whole, agreement.to(whole.dtype)], dim=1))
         confidence = summary[:, :self.joints]
         with torch.autocast(patch.device.type, enabled=False):
-            # The confidence is to say how sure a joint is, not to be bent into what serves the prior.
+            # The confidence must say how sure a joint is. The prior must not train it to say something else.
             unrefined = votes if self.head is None else self.head(votes, confidence.detach())
             joints = unrefined
             if self.refinement is not None:
@@ -165,8 +169,11 @@ class HandDense(nn.Module):
 
 
 def pyramid(x: Tensor, stages: nn.ModuleList, laterals: nn.ModuleList) -> tuple[list[Tensor], Tensor]:
-    """What each of the stages sees, each of which but the first halves the size; and the sum of what all of them
-    see, each through its lateral, as large as the first (feature pyramid, Lin et al. 2017)."""
+    """The features of each stage, and their sum (feature pyramid, Lin et al. 2017).
+
+    Each stage but the first halves the size. For the sum, the features of each stage go through their lateral and are
+    enlarged to the size of the first.
+    """
     features = []
     for stage in stages:
         x = stage(x)
@@ -178,13 +185,15 @@ def pyramid(x: Tensor, stages: nn.ModuleList, laterals: nn.ModuleList) -> tuple[
 
 
 class JointRefinement(nn.Module):
-    """Joints are moved by what is seen where they are: the refinement of the paper (3.3), but that it looks at features
-    which are there already, and at all joints at once, so that what is seen at one can move another.
+    """Moves joints, depending on what is seen at their places: the refinement of the paper (3.3), with two differences.
+
+    It uses features that are already computed. And it looks at all joints at once, so what is seen at one joint can
+    move another.
 
     Args:
-        joints: J.
-        local: channels of the maps that are read where the joints are.
-        whole: features of the whole patch.
+        joints: number of joints, J.
+        local: number of channels of the maps that are read at the joints.
+        whole: number of features of the whole patch.
     """
 
     WIDTH = 64
@@ -203,11 +212,17 @@ class JointRefinement(nn.Module):
         nn.init.zeros_(self.output.bias)
 
     def forward(self, joints: Tensor, votes: Tensor, confidence: Tensor, local: Tensor, whole: Tensor) -> Tensor:
-        """Joints (B, J, 3) and the votes for them (B, J, 3) in cube units, logits (B, J) of how sure they are, maps
-        (B, C, H, W) and features of the whole patch (B, F) -> joints (B, J, 3)."""
+        """Better joints (B, J, 3), in cube units.
+
+        Args:
+            joints, votes: (B, J, 3) in cube units; the votes are those for the joints.
+            confidence: (B, J) logits of how sure the joints are.
+            local: maps (B, C, H, W).
+            whole: features of the whole patch (B, F).
+        """
         dtype = self.all.weight.dtype
         joints, votes, confidence, local, whole = (x.to(dtype) for x in (joints, votes, confidence, local, whole))
-        # Where to read is no output: maps learn from what was read, not from where else it could have been.
+        # No gradient for the places: the maps learn from what was read, not from where else it could have been read.
         places = joints[:, :, None, :2].detach().clamp(-1, 1)
         read = F.grid_sample(local, places, align_corners=False)[..., 0]  # (B, C, J)
         told = torch.cat([joints, votes, confidence[..., None]], dim=2)
@@ -219,14 +234,14 @@ class JointRefinement(nn.Module):
 
 
 def _active(x: Tensor) -> Tensor:
-    # While the output is still zero, plain rectified units die by the hundred and the refinement never begins.
+    # With plain ReLU, hundreds of units die while the output is still zero, and the refinement never starts to learn.
     return F.leaky_relu(x, 0.1)
 
 
 class Residual(nn.Module):
     """Two 3x3 convolutions beside the identity, or beside a 1x1 projection where the shape changes (He et al. 2016).
 
-    One that changes no shape starts as the identity (Goyal et al. 2017), so that it can be added to a trained network.
+    A block that keeps the shape starts as the identity (Goyal et al. 2017). So it can be added to a trained network.
     """
 
     def __init__(self, inputs: int, outputs: int, stride: int) -> None:

@@ -1,8 +1,8 @@
-"""A small network that finds hands in a whole depth image; a design of ours.
+"""A small network that finds hands in a whole depth image. The design is ours.
 
-It sees the image as a camera of FOCAL pixels would take it, so that depth tells how large a hand is in pixels. Each
-cell of its maps says how much it looks like the middle of a hand, and where exactly that middle is (Zhou et al. 2019,
-Objects as Points, with depth instead of a box).
+It sees the image as a camera with a focal length of FOCAL pixels would take it. So the depth of a hand determines its
+size in pixels. Each cell of the maps says how much it looks like the middle of a hand, and where exactly that middle is
+(Zhou et al. 2019, Objects as Points, with depth instead of a box).
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.models.dense import Residual, conv_norm, pyramid
 
 FOCAL = 128.0
-"""Focal length of the images, pixels: a hand at 1 m has about 23."""
+"""Focal length of the images in pixels. A hand at 1 m is about 23 pixels large."""
 CELL = 4
 """Pixels along each side of a cell."""
 MULTIPLE = 32
 """Height and width of the images are multiples of this."""
 FAR = 2.0
-"""Metres; what is further away counts as empty."""
+"""In metres. Everything further away counts as empty."""
 USUAL_Z = 0.6
-"""Metres; the depth of a hand that an untrained network would tell."""
+"""In metres. An untrained network predicts this depth for a hand."""
 
 
 def channels(depth: Tensor) -> Tensor:
     """Depth (B, 1, H, W) in metres, 0 = no reading -> (B, 3, H, W): nearness, its relief, and what is seen.
 
-    Tables and walls are planes, and in nearness (1 / depth) a plane is linear over the image: around any place its
-    mean is its value there. What is left is relief.
+    Tables and walls are planes. The nearness (1 / depth) of a plane is linear over the image, so its mean around a
+    place is its value there. Relief is the difference from this mean.
     """
     seen = ((depth > 0) & (depth < FAR)).to(depth.dtype)
     nearness = seen * 0.3 / torch.where(seen > 0, depth, torch.ones_like(depth)).clamp(min=0.1)
@@ -46,7 +46,7 @@ class HandFinder(nn.Module):
         width: channels of the maps.
 
     Raises:
-        HandPoseError: there are less than two.
+        HandPoseError: the width is less than 2.
     """
 
     def __init__(self, width: int = 24) -> None:
@@ -70,9 +70,9 @@ class HandFinder(nn.Module):
         """Depth (B, 1, H, W) in metres, 0 = no reading, H and W multiples of 32 -> maps of H/4 x W/4 cells.
 
         Returns:
-            Logits (B, H/4, W/4) that a cell is the middle of a hand, and of that hand (B, 3, H/4, W/4) in the
-            coordinates of a cube of 2 m that is centred 1 m before the camera, whose axis goes through the middle of
-            the image: x / z, y / z and z - 1 (`geometry.Cube`).
+            Logits (B, H/4, W/4) that a cell is the middle of a hand, and the middle of that hand (B, 3, H/4, W/4):
+            x / z, y / z and z - 1. These are the cube units (`geometry.Cube`) of a cube of 2 m whose centre is 1 m in
+            front of the camera. The axis of the camera goes through the middle of the image.
         """
         with torch.autocast(depth.device.type, enabled=False):
             x = channels(depth.float())

@@ -1,4 +1,4 @@
-"""Ways to run a network fast, behind one call: `make_engine(network).run(patches)`."""
+"""Engines that run a network fast, all with the same call: `make_engine(network).run(patches)`."""
 
 from __future__ import annotations
 
@@ -20,19 +20,22 @@ from hand_pose_ros.runtime.onnx_engine import OnnxEngine
 __all__ = ['Engine', 'check_device', 'cores', 'default_threads', 'make_engine']
 
 NO_JOINTS = ('hand_finder', 'center_refiner', *REFINERS)
-"""Networks that are parts of something, or find hands."""
+"""Networks that predict no joints by themselves: they find hands, or refine the results of other networks."""
 
 _log = logging.getLogger(__name__)
 _T = TypeVar('_T')
 
 
 def cores() -> int:
-    """Those that this process may use."""
+    """The number of CPU cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count() or 1
 
 
 def default_threads() -> int:
-    """Threads for one network on this machine: at most 4, more do not help networks this small; the rest is ROS's."""
+    """Number of threads for one network on this machine. At most 4: more do not help such small networks.
+
+    With more than two cores, one core is left for ROS.
+    """
     return min(4, cores() if cores() <= 2 else cores() - 1)
 
 
@@ -40,16 +43,16 @@ def make_engine(network: nn.Module, device: str = 'auto', num_threads: int | Non
                 refiner: nn.Module | None = None) -> Engine:
     """The fastest engine for a network (and the refiner of its joints) on a device.
 
-    The modules given are left as they are.
+    The given modules are not changed.
 
     Args:
         device: 'cpu', 'cuda', 'cuda:N', any other device of PyTorch, or 'auto': a CUDA GPU if PyTorch can use one,
-            else the CPU. ONNX Runtime runs the network on a CPU, CUDA graphs (in half precision) on a GPU, PyTorch
-            elsewhere.
-        num_threads: on the CPU, at most: see `OnnxEngine`; None takes `default_threads()`.
+            otherwise the CPU. On a CPU, ONNX Runtime runs the network; on a GPU, CUDA graphs (in half precision); on
+            other devices, PyTorch.
+        num_threads: maximum number of threads on the CPU, see `OnnxEngine`. None = `default_threads()`.
 
     Raises:
-        HandPoseError: the device does not exist here, `num_threads` is below 1, or the network gives no joints.
+        HandPoseError: the device cannot be used here, `num_threads` is below 1, or the network gives no joints.
     """
     if (architecture := getattr(network, 'architecture', '')) in NO_JOINTS:
         raise HandPoseError(f'weights of {architecture} give no joints: choose those of a network that does '
@@ -78,12 +81,12 @@ def make_engine(network: nn.Module, device: str = 'auto', num_threads: int | Non
 
 
 def _chosen() -> tuple[str, str]:
-    """The device that 'auto' stands for, and why."""
+    """The device that 'auto' chooses, and why."""
     if not torch.cuda.is_available():
         return 'cpu', 'no GPU was found'
     try:
         check_device('cuda')
-    except HandPoseError as error:  # it is too old for this PyTorch, for example, or full
+    except HandPoseError as error:  # for example, the GPU is too old for this PyTorch, or its memory is full
         _log.warning('a hand takes longer than it could, as the network runs on the CPU: %s', error)
         return 'cpu', 'the GPU cannot be used'
     return 'cuda', 'a GPU was found'
@@ -97,7 +100,7 @@ def check_device(device: str) -> None:
 def _on(device: str, work: Callable[[], _T]) -> _T:
     try:
         torch.device(device)
-    except RuntimeError:  # which lists twenty names
+    except RuntimeError:  # its message lists twenty names
         raise HandPoseError(f"device '{device}' cannot be used here (PyTorch knows none of this name): "
                             "use 'cpu' or 'cuda'") from None
     if device.startswith('cuda') and not torch.cuda.is_available():
@@ -105,7 +108,7 @@ def _on(device: str, work: Callable[[], _T]) -> _T:
                             "use 'cpu', or install a PyTorch for CUDA and its driver")
     try:
         return work()
-    except (RuntimeError, AssertionError) as error:  # either, depending on what the device lacks
+    except (RuntimeError, AssertionError) as error:  # one of them, depending on what the device lacks
         remedy = "'cpu', or a PyTorch for this GPU" if device == 'cuda' else "'cpu' or 'cuda'"
         raise HandPoseError(f"device '{device}' cannot be used here ({str(error).splitlines()[0]}): "
                             f'use {remedy}') from error

@@ -1,4 +1,4 @@
-"""CUDA graphs: the whole network, with its copies, as one launch, in half precision."""
+"""CUDA graphs: the whole network, including the copies, in one launch and in half precision."""
 
 from __future__ import annotations
 
@@ -20,11 +20,13 @@ from hand_pose_ros.runtime.engine import Array, Engine, Pipeline, TorchEngine
 from hand_pose_ros.runtime.fused import fuse
 
 WARM_UP = 3
-"""Runs before the capture: libraries choose algorithms and allocate in the first ones, which a graph must not hold."""
+"""Number of runs before the capture. In the first runs, libraries choose algorithms and allocate memory. A graph must
+not contain this."""
 LARGEST = 1024
-"""Hands of one graph. Of more, the next are brought to pinned memory while the GPU is at these."""
+"""Maximum number of hands in one graph. If there are more, the next ones are copied to pinned memory while the GPU
+works on these."""
 ROUNDING = 0.02
-"""Cube units. Rounding to half precision moves half of the joints of a palm by less than half of this (tested)."""
+"""In cube units. Rounding to half precision moves half of the joints of a palm by less than half of this (tested)."""
 
 _log = logging.getLogger(__name__)
 
@@ -33,25 +35,26 @@ _log = logging.getLogger(__name__)
 class _Captured:
     graph: torch.cuda.CUDAGraph
     patches: Tensor
-    """Pinned (N, 1, 128, 128), where the graph reads from, in the precision that the network takes."""
+    """(N, 1, 128, 128) in pinned memory, in the precision of the network. The graph reads them."""
     answer: tuple[Tensor, ...]
-    """Pinned, where the graph writes to."""
+    """In pinned memory. The graph writes them."""
     done: torch.cuda.Event = field(default_factory=torch.cuda.Event)
 
     def finish(self, count: int) -> list[Array]:
-        """Wait for the replay; the first `count` answers, copied, for the next replay writes to the same memory."""
+        """Wait for the replay. Returns copies of the first `count` answers: the next replay overwrites the memory."""
         self.done.synchronize()
         return [tensor[:count].numpy().copy() for tensor in self.answer]
 
 
 class CudaEngine(Engine):
-    """One CUDA graph for each batch size that is a power of two, captured when first needed.
+    """One CUDA graph for each batch size that is a power of two. It is captured when it is first needed.
 
-    Other sizes run in the next larger graph, or, beyond the largest, in two of its size by turns. Input and output lie
-    in pinned host memory, and the copies are part of the graph, so that a call is one launch and one wait.
+    Other batch sizes run in the next larger graph. Batches beyond the largest graph run in two graphs of that size, in
+    turns. Input and output are in pinned host memory, and the copies are part of the graph. So a call is one launch and
+    one wait.
 
     Args:
-        kernels: `runtime.kernels`, or None to do without.
+        kernels: `runtime.kernels`, or None to use no kernels of our own.
     """
 
     name = 'cuda graph'
@@ -63,7 +66,7 @@ class CudaEngine(Engine):
         self.pipeline = pipeline.to(self.device).reduce_precision()
         self.stream = torch.cuda.Stream(self.device)
         self._captured: dict[tuple[int, int], _Captured] = {}
-        self.captured_for(1)  # the first image shall not wait
+        self.captured_for(1)  # so that the first image does not wait
 
     def _run(self, patches: Array) -> list[Array]:
         parts: list[list[Array]] = []
@@ -83,7 +86,7 @@ class CudaEngine(Engine):
         return [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
 
     def captured_for(self, count: int, turn: int = 0) -> _Captured:
-        """The graph for this many hands, at most LARGEST; of another `turn` another one."""
+        """The graph for this many hands, at most LARGEST. Each `turn` has its own graph."""
         size = 1 << max(count - 1, 0).bit_length()
         if (size, turn) not in self._captured:
             self._captured[size, turn] = self._capture(size)
@@ -109,16 +112,16 @@ class CudaEngine(Engine):
 
 @contextmanager
 def exact_convolutions() -> Iterator[None]:
-    """What is not halved may not be rounded as much by the convolutions of a tensor core, either."""
+    """Convolutions in full float32. Tensor cores would otherwise round weights that must stay in single precision."""
     cudnn: Any = torch.backends.cudnn
     settings: list[tuple[Any, str, Any]] = [(cudnn, 'allow_tf32', False)]
-    if hasattr(cudnn, 'conv'):  # what PyTorch has since 2.9, and which has to agree with the older flag
+    if hasattr(cudnn, 'conv'):  # since PyTorch 2.9; it must agree with the older flag
         settings += [(cudnn.conv, 'fp32_precision', 'ieee'), (cudnn.rnn, 'fp32_precision', 'ieee')]
     before = []
     for owner, name, _ in settings:
         try:
             before.append(getattr(owner, name))
-        except RuntimeError:  # a program has chosen in the new way, and nobody can read the flag, which is as it was
+        except RuntimeError:  # a program used the new way, so the old flag cannot be read: it still has its default
             before.append(True)
     for owner, name, exact in settings:
         setattr(owner, name, exact)
@@ -130,10 +133,10 @@ def exact_convolutions() -> Iterator[None]:
 
 
 def fastest(pipeline: Pipeline, device: str) -> Engine:
-    """The fastest engine that gives the joints of the CPU.
+    """The fastest engine that gives the same joints as the CPU.
 
-    Kernels are compiled and chosen for the GPU that is there, perhaps the first of its kind: what fails is
-    done without.
+    Kernels are compiled and chosen for the GPU that is there, and it may be the first of its kind. What fails is not
+    used.
     """
     plain = TorchEngine(copy.deepcopy(pipeline))
     for kernels in dict.fromkeys((_own_kernels(), None)):
@@ -150,7 +153,7 @@ def fastest(pipeline: Pipeline, device: str) -> Engine:
 
 
 def _own_kernels() -> ModuleType | None:
-    """`runtime.kernels`, where there is Triton, which PyTorch for CUDA brings along on Linux."""
+    """`runtime.kernels`, if Triton is installed. On Linux, PyTorch for CUDA brings it along."""
     try:
         from hand_pose_ros.runtime import kernels
         if kernels.COMPILED:
@@ -163,8 +166,8 @@ def _own_kernels() -> ModuleType | None:
 
 
 def _agree(engine: Engine, plain: Engine) -> bool:
-    """Whether the joints of a palm are the same from both, but for rounding."""
+    """Whether both engines give the same joints for a palm, except for rounding."""
     x, y = np.meshgrid(*[np.linspace(-1, 1, PATCH_SIZE, dtype=np.float32)] * 2)
     palm = np.where(x ** 2 + y ** 2 < 0.4, 0.3 * x - 0.2 * y, np.float32(1))[None, None]
     moved = np.linalg.norm(engine.run(palm) - plain.run(palm), axis=-1)
-    return bool(np.median(moved) < ROUNDING)  # not of NaN
+    return bool(np.median(moved) < ROUNDING)  # False for NaN

@@ -1,4 +1,4 @@
-"""What every engine is: patches in, named arrays out. And the plain one, which the others are held to."""
+"""What all engines have in common: patches in, named arrays out. Also the plain engine, which is the reference."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Array = NDArray[np.float32]
 
 
 class Pipeline(nn.Module):
-    """A network and what refines its joints as one module that gives a tuple of tensors, named by `outputs`."""
+    """A network and the refiner of its joints, as one module. It returns a tuple of tensors, named by `outputs`."""
 
     def __init__(self, network: nn.Module, refiner: nn.Module | None = None) -> None:
         super().__init__()
@@ -26,12 +26,15 @@ class Pipeline(nn.Module):
         self.outputs: tuple[str, ...] = getattr(network, 'outputs', ('joints',))
 
     def reduce_precision(self) -> Pipeline:
-        """Make half precision of all weights where that moves no joint by half a millimetre.
+        """Convert the weights to half precision where this moves no joint by half a millimetre.
 
-        These stay in single precision: everything if there is a refiner, for which positions must be exact, or a norm
-        that is no part of the weights (`fused.fuse`), before which a layer may give more than a half can hold; a first
-        look, as the view of the second is rounded and must not depend on it; and the stem of a dense network, whose
-        rounded weights move joints by more than all others together.
+        These stay in single precision:
+
+        - Everything, if there is a refiner: it needs exact positions.
+        - Everything, if there is a norm that is not merged into the weights (`fused.fuse`): the layer before it may
+          give values that are too large for half precision.
+        - The first look of two: the view of the second look is rounded, and must not depend on the precision.
+        - The stem of a dense network: its rounded weights move joints by more than all other weights together.
         """
         if self.refiner is not None or any(isinstance(module, nn.BatchNorm2d) for module in self.modules()):
             return self
@@ -47,17 +50,17 @@ class Pipeline(nn.Module):
 
     @property
     def precision(self) -> torch.dtype:
-        """Of the patches that it takes."""
+        """The precision of the patches that the network takes."""
         return next((parameter.dtype for parameter in self.network.parameters()), torch.float32)
 
     def forward(self, patches: Tensor) -> tuple[Tensor, ...]:
-        """Patches (B, 1, 128, 128) -> what `outputs` name, float32."""
+        """Patches (B, 1, 128, 128) -> the tensors named by `outputs`, float32."""
         full = getattr(self.network, 'forward_full', None)
         own = patches.to(self.precision)
         answer: dict[str, Tensor] = {'joints': self.network(own)} if full is None else full(own)
         if self.refiner is not None:
             answer['joints'] = self.refiner(own, answer['joints'])
-        # Where nothing is to be cast, the exported graph shall not try to.
+        # Cast only if needed, so that the exported graph has no needless casts.
         return tuple(value if value.dtype == torch.float32 else value.float()
                      for value in (answer[name] for name in self.outputs))
 
@@ -81,7 +84,7 @@ class Engine(ABC):
 
     Attributes:
         name: of the engine.
-        outputs: names of what `run_full` returns.
+        outputs: names of the arrays that `run_full` returns.
     """
 
     name: str
@@ -96,7 +99,7 @@ class Engine(ABC):
         return self.run_full(patches)['joints']
 
     def run_full(self, patches: Array) -> dict[str, Array]:
-        """As `run`, with everything else that the network says, by name (for hand_dense: `HandDense.forward_full`)."""
+        """As `run`, but all outputs of the network by name (for hand_dense, see `HandDense.forward_full`)."""
         if patches.shape[1:] != (1, PATCH_SIZE, PATCH_SIZE) or patches.dtype != np.float32:
             raise InputError(f'patches must be (B, 1, {PATCH_SIZE}, {PATCH_SIZE}) float32, '
                              f'not {patches.shape} {patches.dtype}')
@@ -104,11 +107,11 @@ class Engine(ABC):
 
     @abstractmethod
     def _run(self, patches: Array) -> list[Array]:
-        """Checked patches -> arrays in the order of `outputs`, which the caller may keep."""
+        """Checked patches -> arrays in the order of `outputs`. The caller may keep them."""
 
 
 class TorchEngine(Engine):
-    """Plain PyTorch, float32, one call after the other."""
+    """Plain PyTorch in float32, one operation after the other."""
 
     name = 'pytorch'
 

@@ -1,4 +1,4 @@
-"""The network that finds hands, run on whole depth images: depth -> cubes."""
+"""Runs the network that finds hands on whole depth images: depth -> cubes."""
 
 from __future__ import annotations
 
@@ -23,19 +23,20 @@ from hand_pose_ros.runtime.onnx_engine import open_session, to_onnx
 SHIPPED = WEIGHTS / 'detection' / 'hand_finder.safetensors'
 
 MIN_SCORE = 0.1
-"""Places that score less are not worth a look."""
+"""Places with a lower score are ignored."""
 MOST = 6
-"""Places, the likeliest, that are told of one image."""
+"""Maximum number of places for one image. The likeliest are returned."""
 
 
 class Finder:
-    """Depth images to cubes around what looks like a hand; as `detection.candidates`, by a network.
+    """Depth images to cubes around everything that looks like a hand: as `detection.candidates`, but with a network.
 
-    Always on the CPU: it takes two or three milliseconds there, and is needed while there is no hand, or for another.
+    It always runs on the CPU, where it takes two or three milliseconds. It is only needed while there is no hand, or to
+    find another one.
 
     Args:
         network: `models.finder.HandFinder`.
-        num_threads: of the CPU.
+        num_threads: number of CPU threads.
     """
 
     def __init__(self, network: nn.Module, num_threads: int = 1) -> None:
@@ -46,10 +47,10 @@ class Finder:
 
     @classmethod
     def from_pretrained(cls, path: str | Path = SHIPPED, num_threads: int = 1) -> Finder:
-        """With the weights that ship, or others.
+        """A finder with the weights that ship, or with others.
 
         Raises:
-            CheckpointError: there are no such weights, they are damaged, or they are of another network.
+            CheckpointError: the weights do not exist, are damaged, or belong to another network.
         """
         checkpoint = load_checkpoint(path)
         if checkpoint.metadata['architecture'] != 'hand_finder':
@@ -58,9 +59,10 @@ class Finder:
 
     def __call__(self, depth: NDArray[np.float32], intrinsics: Intrinsics, *, side: float = 0.30, near: float = 0.1,
                  far: float = 1.5, regions: Sequence[Region] | None = None) -> list[Cube]:
-        """Cubes around hands, the likeliest first; the arguments are those of `detection.candidates`.
+        """Cubes around hands, the likeliest first. The arguments are those of `detection.candidates`.
 
-        The whole image is looked at, whatever the regions are: where an arm is cut off, it ends like a hand.
+        The network always sees the whole image, even if there are regions: an arm that is cut off looks like a hand at
+        its end.
 
         Raises:
             InputError: no camera can have these intrinsics.
@@ -72,12 +74,12 @@ class Finder:
         image[0, 0, :len(rows), :len(columns)] = np.where((small >= near) & (small <= far), small, 0)
         logits, middles = self._session.run(None, {'depth': image})
         logits = logits[0]
-        # A cell that no neighbour surpasses.
+        # Cells whose neighbours are not higher.
         peaks = (logits >= cv2.dilate(logits, np.ones((3, 3)))) & (logits > math.log(MIN_SCORE / (1 - MIN_SCORE)))
         ys, xs = np.nonzero(peaks)
         x, y, z = middles[0][:, ys, xs]
         z = z + 1
-        # The network's camera looks through the middle of its image.
+        # The principal point of the network's camera is the middle of its image.
         x = x + ((width - 1) / 2 - _scaled(intrinsics.cx, intrinsics.fx)) / FOCAL
         y = y + ((height - 1) / 2 - _scaled(intrinsics.cy, intrinsics.fy)) / FOCAL
         u, v = x * intrinsics.fx + intrinsics.cx, y * intrinsics.fy + intrinsics.cy
@@ -90,13 +92,16 @@ class Finder:
 
 
 def _scaled(principal: float, focal: float) -> float:
-    """Where a principal point lies in the image of FOCAL pixels; the middle of the first pixel is 0."""
+    """Position of a principal point in an image with focal length FOCAL. 0 is the middle of the first pixel."""
     return (principal + 0.5) * FOCAL / focal - 0.5
 
 
 @lru_cache(maxsize=8)
 def _grid(intrinsics: Intrinsics) -> tuple[NDArray[np.int64], NDArray[np.int64], int, int]:
-    """Which rows and columns of a camera's image a camera of FOCAL pixels would see, and the size of its image."""
+    """The rows and columns of a camera's image that a camera with a focal length of FOCAL pixels would see.
+
+    Also the height and width of the image of that camera.
+    """
     def line(length: int, focal: float) -> tuple[NDArray[np.int64], int]:
         number = max(1, int(length * FOCAL / focal))
         taken = ((np.arange(number) + 0.5) * focal / FOCAL).astype(np.int64).clip(max=length - 1)

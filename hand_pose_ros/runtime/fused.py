@@ -1,4 +1,4 @@
-"""Layers that a GPU computes with one kernel instead of three: for one hand, the number of kernels is the time."""
+"""Layers that a GPU computes with one kernel instead of three. For one hand, the number of kernels decides the time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hand_pose_ros.models.refiner import Refiner
 
 
 class ConvolutionReLU(nn.Module):
-    """A convolution, what is to be added to it, max-pooling, and ReLU."""
+    """A convolution, an optional addition, max-pooling, and ReLU."""
 
     def __init__(self, convolution: nn.Conv2d, pool: int = 1, kernels: ModuleType | None = None) -> None:
         super().__init__()
@@ -27,7 +27,7 @@ class ConvolutionReLU(nn.Module):
         if self._kernels and added is None and len(x) <= self._kernels.HANDS:
             return self._kernels.convolve(x, self.convolution, self.pool)
         y = self._convolved(x, added)
-        return F.max_pool2d(y, self.pool) if self.pool > 1 else y  # behind ReLU it gives the same
+        return F.max_pool2d(y, self.pool) if self.pool > 1 else y  # after ReLU, the result is the same
 
     def _convolved(self, x: Tensor, added: Tensor | None) -> Tensor:
         layer = self.convolution
@@ -37,14 +37,14 @@ class ConvolutionReLU(nn.Module):
                 if added is None:
                     return torch.cudnn_convolution_relu(x, layer.weight, layer.bias, *sizes)
                 return torch.cudnn_convolution_add_relu(x, layer.weight, added, 1.0, layer.bias, *sizes)
-            except RuntimeError:  # cuDNN has none for these sizes on this GPU
+            except RuntimeError:  # cuDNN has no such kernel for these sizes on this GPU
                 self._one_kernel = False
         y = layer(x)
         return F.relu(y if added is None else y + added)
 
 
 class FusedResidual(nn.Module):
-    """`Residual` of three kernels at most."""
+    """`Residual` with at most three kernels."""
 
     def __init__(self, block: Residual) -> None:
         super().__init__()
@@ -57,7 +57,7 @@ class FusedResidual(nn.Module):
 
 
 class LinearReLU(nn.Linear):
-    """A linear layer, with ReLU or without, computed by `kernels` for few hands."""
+    """A linear layer with or without ReLU. For few hands, `kernels` computes it."""
 
     def __init__(self, layer: nn.Linear, relu: bool, kernels: ModuleType) -> None:
         super().__init__(layer.in_features, layer.out_features, device='meta')
@@ -71,7 +71,7 @@ class LinearReLU(nn.Linear):
 
 
 def fuse(module: nn.Module, kernels: ModuleType | None = None) -> None:
-    """Replace what can be fused of a network that does not train.
+    """Replace the layers that can be fused. The network must not be trained any more.
 
     Args:
         kernels: `runtime.kernels`, if it can be used.
@@ -90,7 +90,7 @@ def fuse(module: nn.Module, kernels: ModuleType | None = None) -> None:
 
 
 def _fuse_neighbours(layers: nn.Sequential, kernels: ModuleType | None) -> None:
-    """Convolution, pooling and ReLU; and linear layer and ReLU."""
+    """Fuse each convolution with its pooling and ReLU, and each linear layer with its ReLU."""
     for i, layer in enumerate(layers):
         behind, pool = i + 1, 1
         if behind < len(layers) and isinstance(pooling := layers[behind], nn.MaxPool2d):
@@ -108,12 +108,12 @@ def _fuse_neighbours(layers: nn.Sequential, kernels: ModuleType | None) -> None:
 
 
 def _is_convolution(layer: nn.Module) -> bool:
-    """One, or one with its norm: see `dense.conv_norm`."""
+    """Whether this is a convolution, or a convolution with its norm (see `dense.conv_norm`)."""
     if isinstance(layer, nn.Sequential):
         return len(layer) == 2 and isinstance(layer[0], nn.Conv2d) and isinstance(layer[1], nn.BatchNorm2d)
     return isinstance(layer, nn.Conv2d)
 
 
 def _plain(layer: nn.Module) -> nn.Conv2d:
-    """The norm in the weights."""
+    """The convolution, with its norm merged into the weights."""
     return fuse_conv_bn_eval(layer[0], layer[1]) if isinstance(layer, nn.Sequential) else layer  # type: ignore

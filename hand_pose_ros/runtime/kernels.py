@@ -1,11 +1,11 @@
-"""Kernels of our own for a GPU (in Triton): what small layers of PyTorch do in three to thirty, in one each.
+"""GPU kernels of our own (in Triton). Each does in one kernel what PyTorch does for small layers in three to thirty.
 
-For one hand the time is the number of kernels, two to three microseconds each, and not what they compute. There are
-three: a convolution of few channels with its pooling and ReLU, a linear layer with its ReLU, and the cut around a joint
-of the refiner. All read and write the precision of their input, and compute in float32.
+For one hand, the number of kernels decides the time, at two to three microseconds each; what they compute does not.
+There are three kernels: a convolution of few channels with its pooling and ReLU, a linear layer with its ReLU, and the
+cut around a joint of the refiner. All read and write the precision of their input, and compute in float32.
 """
 
-# What Triton compiles takes pointers and numbers of its own types.
+# Functions that Triton compiles take pointers and numbers of Triton's types.
 # mypy: disable-error-code="no-untyped-def"
 
 from __future__ import annotations
@@ -18,16 +18,18 @@ from hand_pose_ros.geometry import PATCH_SIZE
 from hand_pose_ros.models.refiner import Region
 
 HANDS = 16
-"""For more at a time, PyTorch is faster: here weights are read for each hand anew, and pixels for each filter."""
+"""With more hands at a time, PyTorch is faster. These kernels read the weights again for each hand, and the pixels
+again for each filter."""
 _PROGRAMS, _LARGE, _SMALL = 128, 512, 128
-"""A GPU has about so many processors; values of a program if there are enough for all of them, and if not."""
+"""About the number of processors of a GPU; the number of values per program if there are enough programs for all
+processors; and the same if there are not."""
 
 
 @triton.jit
 def _convolve(x, weight, bias, y, groups, height, width, rows, columns, s_filter, s_channel, s_row, s_column,
               INPUTS: tl.constexpr, FILTERS: tl.constexpr, SIZE: tl.constexpr, POOL: tl.constexpr,
               CELLS: tl.constexpr):
-    """One group of one image: FILTERS at CELLS places of the answer, all positions that are pooled side by side."""
+    """One group of one image: FILTERS at CELLS places of the answer, with all positions that are pooled for them."""
     plane = tl.program_id(0)
     group = plane % groups
     plane = plane.to(tl.int64)
@@ -72,7 +74,7 @@ def _linear(x, weight, bias, y, inputs, outputs, RELU: tl.constexpr, OUTPUTS: tl
 
 @triton.jit
 def _cut(image, joints, window, count, size, stride, reach, CELLS: tl.constexpr, LINES: tl.constexpr):
-    """LINES of what is around one joint: as `models.refiner.cut`, which says why."""
+    """LINES rows of the window around one joint, as in `models.refiner.cut`, which explains it."""
     which = tl.program_id(0)
     hand = (which // count).to(tl.int64)
     x, y, z = tl.load(joints + which * 3), tl.load(joints + which * 3 + 1), tl.load(joints + which * 3 + 2)
@@ -102,18 +104,19 @@ def _between(first, second, fraction):
 
 
 COMPILED = isinstance(_cut, triton.JITFunction)
-"""And not interpreted on the CPU, as with TRITON_INTERPRET=1."""
+"""Whether kernels are compiled. With TRITON_INTERPRET=1 they are interpreted on the CPU."""
 
 
 def fits(layer: nn.Conv2d, pool: int) -> bool:
-    """Whether `convolve` can compute it, and is worth it: few filters in a group, as tensor cores want many."""
+    """Whether `convolve` can compute this layer, and is worth using: few filters in a group. Tensor cores need many.
+    """
     each = layer.out_channels // layer.groups
     return (layer.padding == (0, 0) and layer.stride == (1, 1) and layer.dilation == (1, 1) and layer.bias is not None
             and layer.kernel_size[0] == layer.kernel_size[1] and each in (4, 8, 16) and pool in (1, 2, 4))
 
 
 def convolve(x: Tensor, layer: nn.Conv2d, pool: int) -> Tensor:
-    """ReLU of a convolution, max-pooled: (N, C, H, W) -> (N, F, (H - K + 1) // pool, (W - K + 1) // pool)."""
+    """Convolution, max-pooling and ReLU: (N, C, H, W) -> (N, F, (H - K + 1) // pool, (W - K + 1) // pool)."""
     x = x.contiguous()
     hands, _, height, width = x.shape
     filters, inputs, size, _ = layer.weight.shape
@@ -129,7 +132,7 @@ def convolve(x: Tensor, layer: nn.Conv2d, pool: int) -> Tensor:
 
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor, relu: bool) -> Tensor:
-    """x (N, I), weight (O, I) and bias (O,) -> (N, O), rectified if asked for."""
+    """x (N, I), weight (O, I) and bias (O,) -> (N, O), with ReLU if `relu`."""
     x = x.contiguous()
     outputs, inputs = weight.shape
     y, each = x.new_empty(len(x), outputs), 4
@@ -139,7 +142,7 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor, relu: bool) -> Tensor:
 
 
 def cut(image: Tensor, joints: Tensor, region: Region) -> Tensor:
-    """As `models.refiner.cut`, for regions whose windows have a power of two of pixels."""
+    """As `models.refiner.cut`, for regions whose window width is a power of two."""
     cells, lines, (hands, count, _) = region.width // region.shrink, 8, joints.shape
     windows = image.new_empty(hands, count, cells, cells)
     _cut[(hands * count, cells // lines)](

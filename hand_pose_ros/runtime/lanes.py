@@ -1,4 +1,4 @@
-"""Convolutions of few channels, rearranged for processors that work on 16 numbers at a time."""
+"""Rearranges convolutions with few channels for processors that work on 16 numbers at a time."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import torch
 from torch import Tensor, nn
 
 LANES = 16
-"""Float32 numbers in a register of AVX-512, and channels in a block of ONNX Runtime's convolutions there."""
+"""Number of float32 values in an AVX-512 register, and of channels in a block of ONNX Runtime's convolutions there."""
 
 
 class PairedConvolution(nn.Module):
-    """A valid convolution for at most LANES / 2 channels, ReLU, and max pooling of even width, two pixels at a time.
+    """Valid convolution with at most LANES / 2 channels, ReLU, and max pooling of even width, two pixels at a time.
 
-    With 8 channels half of the lanes would stay idle. A filter that is one pixel wider, once with its weights to the
-    left and once to the right, gives two neighbouring pixels as 16 channels, whose maximum the pooling takes at last.
-    The arithmetic is the same but for products with zero.
+    With 8 channels, half of the lanes would be idle. So each filter is made one pixel wider and used twice: with its
+    weights on the left, and on the right. This gives two neighbouring pixels as 16 channels. The last step of the
+    pooling takes their maximum. The arithmetic is the same, except for additional products with zero.
     """
 
     def __init__(self, convolution: nn.Conv2d, pool: int) -> None:
@@ -32,13 +32,13 @@ class PairedConvolution(nn.Module):
                 self.pair.bias.copy_(convolution.bias.repeat(2))
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, H, W) -> what convolution, pooling and ReLU would give; in this order ReLU costs nothing."""
+        """(B, C, H, W) -> the result of convolution, pooling and ReLU. In this order, ReLU costs nothing."""
         pooled = self.pool(torch.relu(self.pair(x)))
         return torch.maximum(pooled[:, :self.channels], pooled[:, self.channels:])
 
 
 def fill_lanes(module: nn.Module) -> None:
-    """Replace every Sequential of a small convolution, its pooling and ReLU by pairs."""
+    """In every Sequential of a small convolution, its pooling and ReLU, replace them by a `PairedConvolution`."""
     for each in module.modules():
         if not isinstance(each, nn.Sequential) or len(each) != 3:
             continue

@@ -1,4 +1,4 @@
-"""ONNX Runtime on the CPU: the same graph without Python between its operations, three to five times faster."""
+"""ONNX Runtime on the CPU: the same graph without Python between its operations. It is three to five times faster."""
 
 from __future__ import annotations
 
@@ -19,22 +19,23 @@ from hand_pose_ros.runtime.engine import Array, Engine, Pipeline
 
 OPSET = 17
 WORTH_THREADS = 1.1
-"""Threads must make a network faster by this factor to be used: they wake slowly, and are taken from the rest."""
+"""More threads are used only if they make a network faster by this factor. They wake slowly, and other programs need
+them, too."""
 
 
 def export(pipeline: Pipeline) -> bytes:
-    """The pipeline as an ONNX model with any number of patches."""
+    """The pipeline as an ONNX model for any number of patches."""
     example = torch.zeros(2, 1, PATCH_SIZE, PATCH_SIZE)
     return to_onnx(pipeline, example, 'patches', {name: {0: 'batch'} for name in ('patches', *pipeline.outputs)})
 
 
 def to_onnx(module: nn.Module, example: Tensor, name: str, axes: dict[str, dict[int, str]]) -> bytes:
-    """A module with one input `name` as an ONNX model; `axes` names the free dimensions of the input, then of all
+    """A module with one input `name` as an ONNX model. `axes` names the free dimensions of the input, then of all
     outputs.
 
-    By tracing: the exporter that every supported release of PyTorch has, and that needs no onnxscript.
+    It uses the exporter that traces: every supported release of PyTorch has it, and it needs no onnxscript.
     """
-    # Releases before 2.5 know no other exporter, and not the argument that chooses it.
+    # Releases before 2.5 have no other exporter, and do not know the argument that chooses it.
     choice: dict[str, Any] = {'dynamo': False} if 'dynamo' in inspect.signature(torch.onnx.export).parameters else {}
     with TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter('ignore')
@@ -45,14 +46,14 @@ def to_onnx(module: nn.Module, example: Tensor, name: str, axes: dict[str, dict[
 
 
 def open_session(model: bytes, num_threads: int, batch: int | None = None) -> onnxruntime.InferenceSession:
-    """A session on `num_threads` threads of the CPU, of which the caller's is one; for any `batch`, or for this one."""
+    """A session on `num_threads` CPU threads, including the caller's. `batch` fixes the batch size; None = any."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = num_threads
     options.inter_op_num_threads = 1
-    # Threads that spin between images would take whole cores from the rest of the robot, and wherever cores are
-    # shared they slow the network itself down: docs/performance.md.
+    # Threads that spin between images would take whole cores from the rest of the robot. Where cores are shared, they
+    # also slow down the network itself: see docs/performance.md.
     options.add_session_config_entry('session.intra_op.allow_spinning', '0')
-    # Errors come as exceptions; warnings about the graph are of no use to who runs it.
+    # Errors come as exceptions. Warnings about the graph do not help the user.
     options.log_severity_level = 3
     if batch is not None:
         options.add_free_dimension_override_by_name('batch', batch)
@@ -60,7 +61,7 @@ def open_session(model: bytes, num_threads: int, batch: int | None = None) -> on
 
 
 def _medians(*sessions: onnxruntime.InferenceSession, calls: int = 15) -> list[float]:
-    """Seconds of a call of each for one hand; they are called in turns."""
+    """Median seconds of a call for one hand, for each session. The sessions take turns."""
     patch = {'patches': np.ones((1, 1, PATCH_SIZE, PATCH_SIZE), np.float32)}
     seconds = np.empty((calls, len(sessions)))
     for row in seconds:
@@ -72,10 +73,11 @@ def _medians(*sessions: onnxruntime.InferenceSession, calls: int = 15) -> list[f
 
 
 class OnnxEngine(Engine):
-    """Two sessions of ONNX Runtime. That for one hand knows all shapes beforehand, and works out none in every call.
+    """Two sessions of ONNX Runtime. The one for a single hand knows all shapes in advance, so no call computes them.
 
     Args:
-        num_threads: at most; a hand gets one where more are hardly faster, which is tried out. The joints are the same.
+        num_threads: maximum number of threads. A single hand gets one thread if more are hardly faster, which is
+            measured. The joints are the same.
     """
 
     name = 'onnxruntime'
@@ -83,7 +85,7 @@ class OnnxEngine(Engine):
     def __init__(self, pipeline: Pipeline, num_threads: int) -> None:
         self.outputs, model = pipeline.outputs, export(pipeline)
         self.threads = num_threads
-        """For one hand."""
+        """Number of threads for one hand."""
         self._one, self._many = open_session(model, num_threads, batch=1), open_session(model, num_threads)
         if num_threads > 1:
             alone = open_session(model, 1, batch=1)
@@ -92,7 +94,7 @@ class OnnxEngine(Engine):
                 self._one, self.threads = alone, 1
 
     def _run(self, patches: Array) -> list[Array]:
-        if not len(patches):  # of which ONNX Runtime cannot work out all shapes
+        if not len(patches):  # for no patches, ONNX Runtime cannot compute all shapes
             return [answer[:0] for answer in self._run(np.ones((1, *patches.shape[1:]), np.float32))]
         session = self._one if len(patches) == 1 else self._many
         return session.run(None, {'patches': np.ascontiguousarray(patches)})

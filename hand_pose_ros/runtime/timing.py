@@ -1,4 +1,4 @@
-"""Times of calls that can be compared: they take turns."""
+"""Times of calls. The calls take turns, so that their times can be compared."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from hand_pose_ros.geometry import PATCH_SIZE
 
 WARM_UP = 5
 CALLS = 10
-"""Of one kind before it is the turn of the next."""
+"""Number of times that one call is made before the next takes its turn."""
 
 
 def measure(calls: dict[str, Callable[[], Any]], rounds: int) -> dict[str, dict[str, float]]:
-    """Time each call `rounds` x CALLS times, in turn: one row for each, by name."""
+    """Time each call `rounds` x CALLS times, in turns. Returns one row per call, by name."""
     for call in calls.values():
         for _ in range(WARM_UP):
             call()
@@ -41,7 +41,7 @@ def summary(seconds: list[float]) -> dict[str, float]:
 
 
 def some_patches(count: int) -> Tensor:
-    """(count, 1, 128, 128), half hand, half background, as patches are."""
+    """(count, 1, 128, 128): one half is hand, the other is background, as in real patches."""
     patches = torch.rand(count, 1, PATCH_SIZE, PATCH_SIZE) - 0.5
     patches[..., PATCH_SIZE // 2:] = 1
     return patches

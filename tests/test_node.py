@@ -490,8 +490,15 @@ def test_camera_info_that_was_published_once_before_the_node_came_is_taken(rig: 
     rig.until(lambda: rig.node._latched in rig.node.subscriptions, 'the node to listen to it again')
     infos = rig.client.create_publisher(CameraInfo, 'depth/camera_info', BEST_EFFORT)
     rig.connected(infos)
-    infos.publish(camera_info(WIDTH // 2, HEIGHT // 2, FOCAL / 2))
-    assert rig.answer(rig.camera(), image(depth_with_hand()[::2, ::2])).hands
+    before = len(answers)
+
+    def answered_again() -> bool:  # what is kept may come once more after the first of these
+        infos.publish(camera_info(WIDTH // 2, HEIGHT // 2, FOCAL / 2))
+        publish(image(depth_with_hand()[::2, ::2]))
+        time.sleep(0.05)
+        return len(answers) > before
+    rig.until(answered_again, 'an answer')
+    assert answers[-1].hands
     assert rig.transition('deactivate') and rig.transition('activate')
     rig.until(lambda: sum('listening to' in text for text in rig.said()) == 3, 'to hear all that was said before')
     assert not any('incompatible' in text for text in rig.said())

@@ -22,7 +22,7 @@ def in_one_step(path: str | Path) -> Iterator[Path]:
     Raises:
         InputError: the folder cannot be made or written, or the disk is full.
     """
-    if _takes_files(path):
+    if _is_device(path):
         yield Path(path)
         return
     path = Path(os.path.realpath(path))  # resolve() raises RuntimeError at a link that leads to itself
@@ -54,11 +54,12 @@ def naming_full_disk(path: str | Path) -> Iterator[None]:
 
 def check_writable(path: str | Path) -> None:
     """Raise InputError if there can be no such file: before the work whose result it is to hold."""
-    if not _takes_files(path):
+    if not _is_device(path):
         _begin(Path(os.path.realpath(path))).unlink()
 
 
-def _takes_files(path: str | Path) -> bool:
+def _is_device(path: str | Path) -> bool:
+    """Whether it is written to where it is, as devices and FIFOs are."""
     return Path(path).exists() and not Path(path).is_file() and not Path(path).is_dir()
 
 

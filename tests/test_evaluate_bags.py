@@ -104,6 +104,21 @@ def test_stages_add_up_to_the_total(result):
     assert set(result.summary()['latency_ms']['total']) == {'mean', 'p50', 'p90', 'p99', 'max'}
 
 
+def test_another_hand_is_no_jitter(tmp_path, settings, result):
+    """One hand leaves while another comes: it is tracked next, and that it is elsewhere says nothing of the joints."""
+    with BagWriter(tmp_path / 'two.mcap') as bag:
+        for k in range(FRAMES):
+            seen = np.roll(depth_image(k), -90 if k < FRAMES // 2 else 110, axis=1)
+            bag.write_depth(10**9 + k * STEP_NS, 'camera', seen, CAMERA, codec=None)
+    np.savez(tmp_path / 'truth.npz', joints=result.predictions)
+    two = evaluate_bag(tmp_path / 'two.mcap', replace(settings, ground_truth=str(tmp_path / 'truth.npz')))
+    assert len(set(two.hand_ids)) == 2
+    two.save(tmp_path / 'two.npz')
+    for scored in (two, Result.load(tmp_path / 'two.npz'), replace(two, truth=None)):
+        told, mixed = scored.summary(), replace(scored, hand_ids=None).summary()
+        assert all(told[name] < mixed[name] / 2 for name in ('error_jitter_mm', 'jitter_mm') if name in told)
+
+
 @pytest.mark.parametrize('kind', ['topic', 'npz', 'npz with stamps', 'text'])
 def test_truth_from_a_topic_a_file_or_text_gives_the_same_error(tmp_path, model, result, kind):
     truth = result.predictions + np.array([0.006, 0, 0.008])  # 10 mm off

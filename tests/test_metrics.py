@@ -130,6 +130,15 @@ def test_jitter_is_the_size_of_noise_and_zero_for_smooth_motion():
     assert np.isnan(metrics.jitter_mm(gap)), 'no three consecutive frames'
 
 
+def test_jitter_compares_frames_of_one_hand():
+    joints = np.zeros((8, 21, 3))
+    joints[4:] += 0.5  # another hand
+    assert metrics.jitter_mm(joints) > 100
+    assert metrics.jitter_mm(joints, ['a'] * 4 + ['b'] * 4) == 0
+    assert np.isnan(metrics.jitter_mm(joints, list('aabbccdd'))), 'no three frames of one hand'
+    assert np.isnan(metrics.jitter_mm(joints[:1], ['a']))
+
+
 def test_bone_drift_of_a_hand_worked_case():
     skeleton = SKELETONS['icvl16']
     joints = np.zeros((2, 16, 3))

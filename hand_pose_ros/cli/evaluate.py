@@ -200,9 +200,11 @@ def _evaluate_live(args: argparse.Namespace, settings: Settings) -> Result:
                                     {name: value for name, value in parameters.items() if value is not None})
         topic = bag.depth_topic
     joints = np.full((len(stamps), len(skeleton), 3), np.nan)
+    ids = [''] * len(stamps)
     for row, stamp in enumerate(stamps):
         if stamp in answers.hands and answers.hands[stamp].hands:
-            joints[row] = [(point.x, point.y, point.z) for point in answers.hands[stamp].hands[0].joints]
+            hand = answers.hands[stamp].hands[0]
+            joints[row], ids[row] = [(point.x, point.y, point.z) for point in hand.joints], hand.id
     latency = np.array([answers.latency_s.get(stamp, np.nan) for stamp in stamps])
     dropped = sum(stamp not in answers.hands for stamp in stamps)
     damaged = bool(notes)
@@ -210,7 +212,7 @@ def _evaluate_live(args: argparse.Namespace, settings: Settings) -> Result:
         notes.append(f'{dropped} of {len(stamps)} images got no answer from the node and count as images without a '
                      'hand.')
     result = Result(
-        Path(args.bags[0]).stem, skeleton, intrinsics, joints, stamps_ns=np.array(stamps),
+        Path(args.bags[0]).stem, skeleton, intrinsics, joints, stamps_ns=np.array(stamps), hand_ids=np.array(ids),
         seconds={'image to joints': latency}, notes=tuple(notes), info={
             'bag': args.bags[0], 'depth_topic': topic, 'model': args.model or DEFAULT, 'device': args.device,
             'via_ros': True, 'dropped': dropped, 'damaged': damaged})

@@ -111,7 +111,8 @@ def evaluate_bag(path: str | Path, settings: Settings, progress: Progress = sile
                      f'without a hand; the first: {record.failures[0]}')
     result = Result(
         name=Path(path).stem, skeleton=estimator.skeleton, intrinsics=record.intrinsics,
-        predictions=np.stack(record.joints), stamps_ns=np.array(record.stamps), notes=tuple(notes),
+        predictions=np.stack(record.joints), stamps_ns=np.array(record.stamps), hand_ids=np.array(record.ids),
+        notes=tuple(notes),
         seconds={stage: np.array(values) for stage, values in record.seconds.items()},
         info={'bag': str(path), 'depth_topic': bag.depth_topic, 'model': str(settings.model or DEFAULT),
               'engine': estimator.engine.name, 'frames_per_s': round(rate, 1), 'damaged': damaged})
@@ -177,6 +178,7 @@ class _Record:
         self._estimator = estimator
         self.stamps: list[int] = []
         self.joints: list[NDArray[np.float64]] = []
+        self.ids: list[str] = []
         self.seconds: dict[str, list[float]] = {}
         self.failures: list[str] = []
         self.intrinsics: Intrinsics | None = None
@@ -200,6 +202,7 @@ class _Record:
             self.seconds.setdefault(stage, [np.nan] * len(self.stamps)).append(times.get(stage, np.nan))
         self.stamps.append(image.frame.stamp_ns)
         self.frame_id = image.frame.frame_id
+        self.ids.append(hands[0].id if hands else '')
         self.joints.append(hands[0].joints.astype(np.float64) if hands
                            else np.full((len(self._estimator.skeleton), 3), np.nan))
         return hands

@@ -147,7 +147,7 @@ def align_rigid(predictions: ArrayLike, truth: ArrayLike) -> Floats:
     return aligned
 
 
-def jitter_mm(joints: ArrayLike) -> float:
+def jitter_mm(joints: ArrayLike, hands: ArrayLike | None = None) -> float:
     """How far joints shake about a smooth path: RMS length of the second difference over frames, / sqrt(6).
 
     Uniform motion gives 0; independent noise whose RMS distance is r gives r (the second difference of such
@@ -156,8 +156,12 @@ def jitter_mm(joints: ArrayLike) -> float:
 
     Args:
         joints: (N, J, 3) in metres, consecutive frames.
+        hands: (N,) of which hand they are, for only frames of the same hand are compared; None = all of one.
     """
     lengths = 1000 * np.linalg.norm(np.diff(np.asarray(joints, np.float64), n=2, axis=0), axis=-1)
+    if hands is not None:
+        hands = np.asarray(hands)
+        lengths = lengths[(hands[:-2] == hands[1:-1]) & (hands[1:-1] == hands[2:])]
     lengths = lengths[np.isfinite(lengths)]
     return float(np.sqrt((lengths ** 2).mean() / 6)) if lengths.size else float('nan')
 
@@ -215,13 +219,15 @@ def paired_bootstrap(a_mm: ArrayLike, b_mm: ArrayLike, *, block: int = 30, resam
     return float(difference.mean()), float(low), float(high)
 
 
-def summarise(predictions: ArrayLike, truth: ArrayLike, skeleton: Skeleton) -> dict[str, Any]:
+def summarise(predictions: ArrayLike, truth: ArrayLike, skeleton: Skeleton,
+              hands: ArrayLike | None = None) -> dict[str, Any]:
     """Every accuracy number of a result, under the names that JSON files carry.
 
     Fractions are of labelled frames (`within_mm`, `auc_0_80`) or joints (`pck_mm`); NaN becomes None.
 
     Args:
         predictions, truth: (N, J, 3) in metres, J the joints of the skeleton.
+        hands: see `jitter_mm`.
 
     Raises:
         InputError: the shapes differ, or are those of another skeleton.
@@ -245,14 +251,14 @@ def summarise(predictions: ArrayLike, truth: ArrayLike, skeleton: Skeleton) -> d
         'auc_0_80': auc(errors, 80),
         'mean_translation_aligned_mm': mean_mm(joint_errors_mm(align_translation(predictions, truth), truth)),
         'mean_rigid_aligned_mm': mean_mm(joint_errors_mm(align_rigid(predictions, truth), truth)),
-        'error_jitter_mm': jitter_mm(np.asarray(predictions, np.float64) - np.asarray(truth, np.float64)),
-        **smoothness(predictions, skeleton),
+        'error_jitter_mm': jitter_mm(np.asarray(predictions, np.float64) - np.asarray(truth, np.float64), hands),
+        **smoothness(predictions, skeleton, hands),
     })
 
 
-def smoothness(predictions: ArrayLike, skeleton: Skeleton) -> dict[str, Any]:
+def smoothness(predictions: ArrayLike, skeleton: Skeleton, hands: ArrayLike | None = None) -> dict[str, Any]:
     """The numbers that need no truth: `jitter_mm`, and `bone_drift_mm` averaged over the bones."""
-    return finite_or_none({'jitter_mm': jitter_mm(predictions),
+    return finite_or_none({'jitter_mm': jitter_mm(predictions, hands),
                            'bone_drift_mm': mean_mm(bone_drift_mm(predictions, skeleton))})
 
 

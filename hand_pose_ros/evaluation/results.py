@@ -41,6 +41,7 @@ class Result:
         notes: whatever a reader of the numbers must know.
         info: where it comes from: files, model, device, command.
         in_time: each frame follows the one before; if not, nothing is told of jitter and bone drift.
+        hand_ids: (N,) str, of the tracked hand, or None if it is always the same; jitter is told within each hand.
     """
 
     name: str
@@ -54,6 +55,7 @@ class Result:
     notes: tuple[str, ...] = ()
     info: Mapping[str, Any] = field(default_factory=dict)
     in_time: bool = True
+    hand_ids: NDArray[np.str_] | None = None
 
     @property
     def errors_mm(self) -> NDArray[np.float64]:
@@ -67,17 +69,16 @@ class Result:
         detected = np.isfinite(self.predictions).all(-1).any(-1)
         summary: dict[str, Any] = {'name': self.name, 'frames': len(self.predictions)}
         if self.truth is None:
-            summary |= metrics.smoothness(self.predictions, self.skeleton)
+            summary |= metrics.smoothness(self.predictions, self.skeleton, self._hands())
         else:
-            summary |= self._accuracy(self.predictions, self.truth)
+            summary |= self._accuracy(slice(None))
         summary |= {'frames_total': len(self.predictions),
                     'detection_rate': float(np.mean(detected)) if self.predictions.size else None}
         if self.parts and self.in_time:  # hands of several subjects are not one hand that changes
             summary['bone_drift_mm'] = metrics.finite_or_none(self._bone_drift_mm())
         if self.parts and self.truth is not None:
             summary['parts'] = {
-                name: self._accuracy(self.predictions[start:stop], self.truth[start:stop])
-                for name, (start, stop) in self.parts.items()}
+                name: self._accuracy(slice(start, stop)) for name, (start, stop) in self.parts.items()}
         if self.seconds:
             summary['latency_ms'] = {
                 stage: metrics.percentiles(1000 * seconds) for stage, seconds in self.seconds.items()}
@@ -91,8 +92,17 @@ class Result:
         with np.errstate(invalid='ignore'):
             return metrics.mean_mm(np.sqrt(np.nansum(frames * drifts ** 2, axis=0) / frames.sum(axis=0)))
 
-    def _accuracy(self, predictions: NDArray[np.float64], truth: NDArray[np.float64]) -> dict[str, Any]:
-        summary = metrics.summarise(predictions, truth, self.skeleton)
+    def _hands(self) -> NDArray[np.int64]:
+        """(N,) a number that changes with the hand: where another one is tracked, and where another part begins."""
+        change = np.zeros(len(self.predictions), np.bool_)
+        if self.hand_ids is not None:
+            change[1:] = self.hand_ids[1:] != self.hand_ids[:-1]
+        change[[start for start, _ in self.parts.values()]] = True
+        return change.cumsum()
+
+    def _accuracy(self, rows: slice) -> dict[str, Any]:
+        assert self.truth is not None
+        summary = metrics.summarise(self.predictions[rows], self.truth[rows], self.skeleton, self._hands()[rows])
         return summary if self.in_time else summary | dict.fromkeys(metrics.SMOOTHNESS)
 
     def save(self, path: str | Path) -> None:
@@ -102,7 +112,7 @@ class Result:
                 'parts': dict(self.parts), 'info': dict(self.info), 'stages': list(self.seconds),
                 'in_time': self.in_time}
         arrays: dict[str, Any] = {'joints': self.predictions, 'meta': np.array(json.dumps(meta))}
-        optional = {'truth': self.truth, 'stamps_ns': self.stamps_ns}
+        optional = {'truth': self.truth, 'stamps_ns': self.stamps_ns, 'hand_ids': self.hand_ids}
         arrays |= {key: value for key, value in optional.items() if value is not None}
         arrays |= {f'seconds_{k}': seconds for k, seconds in enumerate(self.seconds.values())}
         with in_one_step(path) as part, part.open('wb') as file:
@@ -127,7 +137,8 @@ class Result:
                     truth=file.get('truth'), stamps_ns=file.get('stamps_ns'),
                     seconds={stage: file[f'seconds_{k}'] for k, stage in enumerate(meta['stages'])},
                     parts={name: (start, stop) for name, (start, stop) in meta['parts'].items()},
-                    notes=tuple(meta['notes']), info=meta['info'], in_time=meta.get('in_time', True))
+                    notes=tuple(meta['notes']), info=meta['info'], in_time=meta.get('in_time', True),
+                    hand_ids=file.get('hand_ids'))
         except OSError as error:
             raise InputError(f'{path}: the file cannot be read ({error.strerror or error})') from None
         except DAMAGE:

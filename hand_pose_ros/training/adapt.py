@@ -266,6 +266,7 @@ def judge(found: Look, engine: Engine, progress: Progress) -> Numbers:
     whole = found.result
     assert whole.stamps_ns is not None
     part = replace(whole, predictions=whole.predictions[held], stamps_ns=whole.stamps_ns[held], seconds={}, info={},
+                   hand_ids=None if whole.hand_ids is None else whole.hand_ids[held],
                    truth=None if whole.truth is None else whole.truth[held]).summary()
     return {'found': part['detection_rate'], 'error_mm': part.get('mean_mm'), **own,
             'jitter_mm': part['jitter_mm'], 'bone_drift_mm': part['bone_drift_mm']}

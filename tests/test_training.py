@@ -710,25 +710,26 @@ def validations(run: Path) -> list[dict]:
     return [row for row in map(json.loads, (run / 'metrics.jsonl').open()) if 'val_mm' in row]
 
 
-def test_validation_data_that_cannot_be_used_are_told_before_the_training(tmp_path):
-    def bag(split: str, skeleton: Skeleton) -> None:
-        joints = np.array([0, 0, 0.5]) + np.random.default_rng(0).uniform(-0.05, 0.05, (len(skeleton), 3))
-        hand = SimpleNamespace(id='0', side='right', score=1.0, joints=joints, confidence=np.ones(len(skeleton)),
-                               cube=Cube((0.0, 0.0, 0.5), 0.3))
-        with BagWriter(tmp_path / split / 'hand.mcap') as file:
-            file.write_depth(0, 'camera', np.full((480, 640), 0.5, np.float32), CAMERA)
-            file.write_hands(0, 'camera', [hand], skeleton)
+def record_hand(folder: Path, skeleton: Skeleton = HAND21) -> None:
+    joints = np.array([0, 0, 0.5]) + np.random.default_rng(0).uniform(-0.05, 0.05, (len(skeleton), 3))
+    hand = SimpleNamespace(id='0', side='right', score=1.0, joints=joints, confidence=np.ones(len(skeleton)),
+                           cube=Cube((0.0, 0.0, 0.5), 0.3))
+    with BagWriter(folder / 'hand.mcap') as file:
+        file.write_depth(0, 'camera', np.full((480, 640), 0.5, np.float32), CAMERA)
+        file.write_hands(0, 'camera', [hand], skeleton)
 
+
+def test_validation_data_that_cannot_be_used_are_told_before_the_training(tmp_path):
     def run() -> Run:
         recipe = get_recipe('paper', ['dataset=bags', f'root={tmp_path}', 'options.bottleneck=none'])
         return Run(tmp_path / 'run', recipe, Machine(tmp_path / 'cache', workers=0))
-    bag('train', HAND21)
+    record_hand(tmp_path / 'train')
     with pytest.raises(HandPoseError, match='val holds no bags'):
         run()
-    bag('val', get_skeleton('icvl16'))
+    record_hand(tmp_path / 'val', get_skeleton('icvl16'))
     with pytest.raises(TrainingError, match='bags-val has joints of icvl16, but bags-train those of hand21'):
         run()
-    bag('val', HAND21)
+    record_hand(tmp_path / 'val')
     run()
 
 
@@ -802,6 +803,22 @@ def test_a_cuda_graph_trains_as_its_kernels_do(folder, tmp_path, network, monkey
     start, graph = trained(tmp_path / 'graph', captured=True)
     _, kernels = trained(tmp_path / 'kernels', captured=False)
     assert (graph - kernels).norm() < 0.1 * (kernels - start).norm()
+
+
+def test_bags_of_another_folder_were_not_seen_by_the_base(tmp_path):
+    def run(folder: str, *overrides: str) -> Run:
+        recipe = get_recipe('paper', [*TINY, 'dataset=bags', 'options.bottleneck=none', f'root={tmp_path / folder}',
+                                      *overrides])
+        return Run(tmp_path / 'run', recipe, Machine(tmp_path / 'cache', workers=0))
+    for name in ('first', 'second'):
+        record_hand(tmp_path / name / 'train')
+        record_hand(tmp_path / name / 'val')
+    first = run('first', 'batch_size=1', 'samples=1')
+    first.train()
+    base = f'base={first.folder.checkpoint("last")}'
+    with pytest.raises(TrainingError, match='trained on all of bags-train'):
+        run('first', 'refiner=or_ref', base)
+    assert list(run('second', 'refiner=or_ref', base).stream.window(0)) == [0]
 
 
 def test_a_refiner_learns_from_what_its_base_has_not_seen(folder, tmp_path):

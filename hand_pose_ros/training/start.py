@@ -45,7 +45,10 @@ def shards_seen(recipe: Recipe, base: Checkpoint | None, data: Dataset) -> int:
     """One past the last shard, as large as the recipe says, that a base and what that started from were trained on."""
     if base is None or base.metadata.get('training_data') != data.name:
         return 0
-    size = base.metadata.get('recipe', {}).get('shard_size', recipe.shard_size)
+    of = base.metadata.get('recipe', {})
+    if recipe.dataset == 'bags' and of.get('root', recipe.root) != recipe.root:  # other recordings have the same name
+        return 0
+    size = of.get('shard_size', recipe.shard_size)
     return -(-int(base.metadata['training_shards']) * size // recipe.shard_size)
 
 

@@ -4,6 +4,7 @@ import importlib
 import re
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -62,11 +63,16 @@ def test_a_gpu_that_this_pytorch_cannot_use(weights: Path, monkeypatch: pytest.M
         raise HandPoseError(f'{device} is too old')
     monkeypatch.setattr('torch.cuda.is_available', lambda: True)
     monkeypatch.setattr('torch.cuda.device_count', lambda: 1)
-    monkeypatch.setattr('torch.cuda.get_device_name', lambda number: 'GTX 780 Ti')
+    monkeypatch.setattr('torch.cuda.get_device_name', ['GTX 780 Ti', 'GTX 680'].__getitem__)
     monkeypatch.setattr('hand_pose_ros.runtime.check_device', refuse)
     _, about = report(capsys)
     assert about['device'][0].startswith('ok: onnxruntime on the CPU')
     assert about['device'][1] == 'note: there is GTX 780 Ti, but cuda is too old'
+    engine = SimpleNamespace(name='cuda graph', run=lambda patches: None)
+    monkeypatch.setattr('hand_pose_ros.runtime.make_engine', lambda network: engine)
+    for count, told in ((1, 'GTX 780 Ti'), (2, 'GTX 780 Ti (cuda:0 of 2; device cuda:N chooses another)')):
+        monkeypatch.setattr('torch.cuda.device_count', lambda count=count: count)
+        assert report(capsys)[1]['device'] == [f'ok: cuda graph on {told}'], 'one GPU is used, not all'
 
 
 def test_missing_and_damaged_weights(weights: Path, monkeypatch: pytest.MonkeyPatch,

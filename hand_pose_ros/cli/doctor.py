@@ -94,17 +94,20 @@ def _device() -> Findings:
     from hand_pose_ros.runtime import check_device, default_threads, make_engine
     from hand_pose_ros.runtime.onnx_engine import OnnxEngine
 
-    gpus = ', '.join(torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count()))
+    count = torch.cuda.device_count()
+    gpu = torch.cuda.get_device_name(0) if count else ''  # the one that is used
+    if count > 1:
+        gpu += f' (cuda:0 of {count}; device cuda:N chooses another)'
     engine = make_engine(build('deep_prior'))
     engine.run(np.zeros((1, 1, 128, 128), np.float32))  # builds and runs the real thing
     on_cpu = isinstance(engine, OnnxEngine)
-    yield 'ok', f'{engine.name} on {f"the CPU, {default_threads()} threads of {os.cpu_count()}" if on_cpu else gpus}'
-    if gpus and on_cpu:
+    yield 'ok', f'{engine.name} on {f"the CPU, {default_threads()} threads of {os.cpu_count()}" if on_cpu else gpu}'
+    if gpu and on_cpu:
         try:
             check_device('cuda')
         except HandPoseError as error:
-            yield 'note', f'there is {gpus}, but {error}'
-    elif not gpus and shutil.which('nvidia-smi'):
+            yield 'note', f'there is {gpu}, but {error}'
+    elif not gpu and shutil.which('nvidia-smi'):
         yield 'note', (f'there is an NVIDIA driver, but PyTorch {torch.__version__} sees no GPU: install a PyTorch '
                        'for CUDA if the network should run there')
 

@@ -21,7 +21,7 @@ from hand_pose_ros.cli import main
 from hand_pose_ros.cli.arguments import keep_input
 from hand_pose_ros.cli.evaluate import _names
 from hand_pose_ros.cli.hand_bag import HandBag
-from hand_pose_ros.errors import InputError
+from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.estimator import HandEstimate, HandPoseEstimator
 from hand_pose_ros.evaluation import bag_evaluation
 from hand_pose_ros.evaluation.bag_evaluation import Settings, evaluate_bag, evaluate_bags
@@ -351,6 +351,24 @@ def test_processes_of_torchrun_share_the_bags(tmp_path, bag, model):
     assert not (tmp_path / '1.json').exists()
     got = json.loads((tmp_path / '0.json').read_text())['bags']
     assert {name: one['frames'] for name, one in got.items()} == {str(bag): FRAMES, str(other): 5}
+
+
+@pytest.mark.parametrize('asked, usable, taken', [('auto', True, 'cuda:1'), ('cuda', True, 'cuda:1'),
+                                                  ('auto', False, 'auto'), ('cpu', True, 'cpu'),
+                                                  ('cuda:0', True, 'cuda:0')])
+def test_each_process_of_torchrun_works_on_a_gpu_of_its_own(settings, monkeypatch, asked, usable, taken):
+    def check(device):
+        if not usable:
+            raise HandPoseError(f'{device} is too old')
+
+    devices = []
+    monkeypatch.setattr(bag_evaluation, 'evaluate_bag', lambda _, settings, **__: devices.append(settings.device))
+    monkeypatch.setattr(bag_evaluation, 'check_device', check)
+    monkeypatch.setattr('torch.cuda.is_available', lambda: True)
+    monkeypatch.setattr('torch.cuda.device_count', lambda: 2)
+    monkeypatch.setenv('LOCAL_RANK', '3')  # there are more processes than GPUs
+    list(evaluate_bags(['a.mcap'], replace(settings, device=asked)))
+    assert devices == [taken]
 
 
 def test_the_live_node_answers_what_the_estimator_says(ros_domain, tmp_path, model, settings):

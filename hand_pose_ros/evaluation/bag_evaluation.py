@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from hand_pose_ros.bags import DepthBag, Frame
@@ -29,7 +30,7 @@ from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.models.checkpoints import DEFAULT
 from hand_pose_ros.processes import leave_with_parent
-from hand_pose_ros.runtime import cores
+from hand_pose_ros.runtime import check_device, cores
 from hand_pose_ros.skeleton import Skeleton
 
 _T = TypeVar('_T')
@@ -125,7 +126,7 @@ def evaluate_bags(paths: Sequence[str | Path], settings: Settings, jobs: int | N
     """Evaluate many bags at once; one that fails does not stop the others.
 
     Where torchrun has started several processes, on one or more machines, each takes its share of the bags, and the
-    first gets all results in the end; the others get none.
+    first gets all results in the end; the others get none. Each works on a GPU of its own, as far as there are enough.
 
     Args:
         jobs: bags at the same time on this machine; None takes one per core.
@@ -273,11 +274,24 @@ def _start_worker() -> None:
 
 def _attempt(path: str | Path, settings: Settings, open_sink: OpenSink | None) -> Outcome:
     try:
-        return evaluate_bag(path, settings, open_sink=open_sink)
+        return evaluate_bag(path, replace(settings, device=_own_gpu(settings.device)), open_sink=open_sink)
     except HandPoseError as error:
         return error
     except Exception as error:  # a defect of ours must not lose the results of the other bags
         return _unexpected(path, error)
+
+
+def _own_gpu(device: str) -> str:
+    """The device; for 'cuda' and 'auto' under torchrun, the GPU that belongs to this process."""
+    if device not in ('auto', 'cuda') or 'LOCAL_RANK' not in os.environ or not torch.cuda.is_available():
+        return device
+    own = f'cuda:{int(os.environ["LOCAL_RANK"]) % torch.cuda.device_count()}'
+    if device == 'auto':
+        try:
+            check_device(own)
+        except HandPoseError:  # it may still be another one, or the CPU
+            return device
+    return own
 
 
 def _unexpected(path: str | Path, error: Exception) -> HandPoseError:

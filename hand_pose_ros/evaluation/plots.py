@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import logging
+import re
+import warnings
 from collections.abc import Sequence
+from contextlib import suppress
+from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -11,12 +16,16 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.font_manager import findSystemFonts, fontManager, get_font, ttfFontProperty
+from matplotlib.text import Text
 from numpy.typing import NDArray
 
 from hand_pose_ros.evaluation import metrics
 from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.evaluation.tables import number
 from hand_pose_ros.files import write_bytes
+
+log = logging.getLogger(__name__)
 
 # Okabe & Ito (2008): told apart with any colour vision, and in grey by their order of lightness.
 COLORS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9', '#000000', '#B8A800')
@@ -120,17 +129,54 @@ def latency(result: Result) -> Figure:
 
 
 def to_bytes(figure: Figure, form: str) -> bytes:
-    """The figure as the content of a 'png' or 'svg' file."""
-    buffer = BytesIO()
-    with matplotlib.rc_context(STYLE):
-        figure.savefig(buffer, format=form, dpi=150, metadata={'Date': None} if form == 'svg' else None)
-    return buffer.getvalue()
+    """The figure as the content of a 'png' or 'svg' file. Letters that its font lacks are of other installed fonts."""
+    data, lacking = _drawn(figure, form)
+    if lacking and (families := _families(lacking)):
+        for text in figure.findobj(Text):
+            if isinstance(text, Text) and set(text.get_text()) & set(lacking):
+                text.set_fontfamily([STYLE['font.family'], *families])
+        data, lacking = _drawn(figure, form)
+    if lacking:
+        _tell_boxes(lacking)
+    return data
 
 
 def save(figure: Figure, path: str | Path) -> None:
     """Write `path`.png and `path`.svg."""
     for form in ('png', 'svg'):
         write_bytes(f'{path}.{form}', to_bytes(figure, form))
+
+
+def _drawn(figure: Figure, form: str) -> tuple[bytes, str]:
+    """The content of the file, and the letters in whose place it has boxes."""
+    buffer = BytesIO()
+    with matplotlib.rc_context(STYLE), warnings.catch_warnings(record=True) as caught:
+        warnings.filterwarnings('always', 'Glyph')
+        figure.savefig(buffer, format=form, dpi=150, metadata={'Date': None} if form == 'svg' else None)
+    codes = {int(found[1]) for told in caught if (found := re.match(r'Glyph (\d+) ', str(told.message)))}
+    return buffer.getvalue(), ''.join(map(chr, sorted(codes)))
+
+
+@lru_cache
+def _families(letters: str) -> list[str]:
+    """Installed fonts that have the letters, as far as there are any. Reading all fonts takes a while."""
+    families, wanted = [], set(map(ord, letters))
+    for path in sorted(findSystemFonts()):
+        with suppress(Exception):  # a font that cannot be read
+            font = get_font(path)
+            name, style = (entry := ttfFontProperty(font)).name, (entry.style, entry.weight)
+            if style == ('normal', 400) and (has := wanted & set(font.get_charmap())):
+                fontManager.addfont(path)  # it may be newer than the list that matplotlib keeps
+                families.append(name)
+                wanted -= has
+    return families
+
+
+@lru_cache
+def _tell_boxes(letters: str) -> None:
+    """Once, for there are many plots."""
+    log.warning('plots show boxes in place of %s: install a font that has these letters, for example fonts-noto-cjk',
+                letters)
 
 
 def _figure(width: float, height: float, columns: int = 1) -> tuple[Figure, NDArray[np.object_]]:

@@ -66,6 +66,7 @@ def test_report_is_one_file_that_needs_nothing_else(result, tmp_path):
     assert not re.search(r'https?://|<link|@import|url\(|src="(?!data:)', outside)
     assert '<odd>' not in html and '<&>' not in html, 'what users name is escaped'
     summary = result.summary()
+    assert 'On the depth image' in html
     assert f'{summary["mean_mm"]:.3f}' in html and f'{100 * summary["within_mm"]["20"]:.2f}' in html
     assert {file.name for file in path.parent.iterdir()} == {'report.html', *(
         f'{name}.{form}' for name in ('curves', 'joints', 'errors', 'latency') for form in ('png', 'svg'))}
@@ -101,7 +102,7 @@ def test_report_without_truth_shows_times_and_first_middle_last(result, tmp_path
     blind = Result('b', HAND21, CAMERA, result.predictions, stamps_ns=result.stamps_ns, seconds=result.seconds)
     html = write_report([blind], tmp_path).read_text()
     assert re.findall(r'<h3>(\w+): frame (\d+)</h3>', html) == [('First', '1'), ('Middle', '21'), ('Last', '40')]
-    assert 'Accuracy' not in html
+    assert 'Accuracy' not in html and 'On the depth image' not in html
     assert list(tiles(html)) == ['hands found', 'latency, 99th percentile', 'jitter']
     assert tiles(html)['jitter'] == f'{blind.summary()["jitter_mm"]:.1f} mm'
     live = replace(blind, seconds={'image to joints': blind.seconds['total']})  # the node tells no stages

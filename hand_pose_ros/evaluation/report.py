@@ -67,6 +67,7 @@ def write_report(results: Sequence[Result], folder: str | Path, read_depths: Rea
     for name, figure in figures.items():
         plots.save(figure, folder / name)
     cards = _cards(result, read_depths)
+    on_images = 'On the depth image: the estimate and, where it is known, the truth. ' if read_depths else ''
     sections = [
         _section('Notes', ''.join(f'<p>{escape(note)}</p>' for note in notes), 'notes') if notes else '',
         _tiles(summary),
@@ -76,8 +77,8 @@ def write_report(results: Sequence[Result], folder: str | Path, read_depths: Rea
             ('joints', 'Which joints are hard', _fingers(scored)),
             ('errors', 'When it errs', ''),
             ('latency', 'What a frame costs', _latency(summary))) if name in figures),
-        _section('Frames', '<p class="soft">On the depth image: the estimate and, where it is known, the truth. In 3D '
-                 '(drag to turn, wheel to zoom, double-click to go back) the truth is dashed.</p><div class="frames">'
+        _section('Frames', f'<p class="soft">{on_images}In 3D (drag to turn, wheel to zoom, double-click to go back) '
+                 'the truth is dashed.</p><div class="frames">'
                  + ''.join(card.html for card in cards) + '</div>') if cards else '',
         _section('Where this comes from', _table(
             ('', ''), sorted((key, str(value)) for key, value in result.info.items()), text=True)),

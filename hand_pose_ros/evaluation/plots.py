@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import logging
-import re
 import warnings
 from collections.abc import Sequence
-from contextlib import suppress
-from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -16,16 +12,13 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.font_manager import findSystemFonts, fontManager, get_font, ttfFontProperty
-from matplotlib.text import Text
+from matplotlib.font_manager import fontManager
 from numpy.typing import NDArray
 
 from hand_pose_ros.evaluation import metrics
 from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.evaluation.tables import number
 from hand_pose_ros.files import write_bytes
-
-log = logging.getLogger(__name__)
 
 # Okabe & Ito (2008): told apart with any colour vision, and in grey by their order of lightness.
 COLORS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9', '#000000', '#B8A800')
@@ -36,11 +29,15 @@ LINE_INCHES = 0.19
 LONGEST = 80
 """Letters of a name that a legend has room for."""
 
+_CJK = ('Noto Sans CJK JP', 'WenQuanYi Micro Hei', 'WenQuanYi Zen Hei', 'Droid Sans Fallback')
+"""Fonts with Chinese, Japanese and Korean letters, which names of files may have."""
+
 STYLE: dict[Any, Any] = {
-    'font.family': 'DejaVu Sans', 'font.size': 10, 'axes.titlesize': 11, 'axes.titleweight': 'bold',
-    'axes.titlelocation': 'left', 'axes.spines.top': False, 'axes.spines.right': False, 'axes.grid': True,
-    'grid.color': '#e4e7eb', 'grid.linewidth': 0.8, 'axes.axisbelow': True, 'axes.edgecolor': '#8a94a0',
-    'xtick.color': '#4a5560', 'ytick.color': '#4a5560', 'axes.labelcolor': '#2a3138', 'legend.frameon': False,
+    'font.family': ['DejaVu Sans', *(name for name in _CJK if name in fontManager.get_font_names())],
+    'font.size': 10, 'axes.titlesize': 11, 'axes.titleweight': 'bold', 'axes.titlelocation': 'left',
+    'axes.spines.top': False, 'axes.spines.right': False, 'axes.grid': True, 'grid.color': '#e4e7eb',
+    'grid.linewidth': 0.8, 'axes.axisbelow': True, 'axes.edgecolor': '#8a94a0', 'xtick.color': '#4a5560',
+    'ytick.color': '#4a5560', 'axes.labelcolor': '#2a3138', 'legend.frameon': False,
     'svg.hashsalt': 'hand_pose_ros',  # the same figure gives the same file
     'text.parse_math': False,  # names of files may hold $
 }
@@ -129,54 +126,18 @@ def latency(result: Result) -> Figure:
 
 
 def to_bytes(figure: Figure, form: str) -> bytes:
-    """The figure as the content of a 'png' or 'svg' file. Letters that its font lacks are of other installed fonts."""
-    data, lacking = _drawn(figure, form)
-    if lacking and (families := _families(lacking)):
-        for text in figure.findobj(Text):
-            if isinstance(text, Text) and set(text.get_text()) & set(lacking):
-                text.set_fontfamily([STYLE['font.family'], *families])
-        data, lacking = _drawn(figure, form)
-    if lacking:
-        _tell_boxes(lacking)
-    return data
+    """The figure as the content of a 'png' or 'svg' file."""
+    buffer = BytesIO()
+    with matplotlib.rc_context(STYLE), warnings.catch_warnings():
+        warnings.filterwarnings('ignore', 'Glyph')  # there is a box in place of a letter that no font has
+        figure.savefig(buffer, format=form, dpi=150, metadata={'Date': None} if form == 'svg' else None)
+    return buffer.getvalue()
 
 
 def save(figure: Figure, path: str | Path) -> None:
     """Write `path`.png and `path`.svg."""
     for form in ('png', 'svg'):
         write_bytes(f'{path}.{form}', to_bytes(figure, form))
-
-
-def _drawn(figure: Figure, form: str) -> tuple[bytes, str]:
-    """The content of the file, and the letters in whose place it has boxes."""
-    buffer = BytesIO()
-    with matplotlib.rc_context(STYLE), warnings.catch_warnings(record=True) as caught:
-        warnings.filterwarnings('always', 'Glyph')
-        figure.savefig(buffer, format=form, dpi=150, metadata={'Date': None} if form == 'svg' else None)
-    codes = {int(found[1]) for told in caught if (found := re.match(r'Glyph (\d+) ', str(told.message)))}
-    return buffer.getvalue(), ''.join(map(chr, sorted(codes)))
-
-
-@lru_cache
-def _families(letters: str) -> list[str]:
-    """Installed fonts that have the letters, as far as there are any. Reading all fonts takes a while."""
-    families, wanted = [], set(map(ord, letters))
-    for path in sorted(findSystemFonts()):
-        with suppress(Exception):  # a font that cannot be read
-            font = get_font(path)
-            name, style = (entry := ttfFontProperty(font)).name, (entry.style, entry.weight)
-            if style == ('normal', 400) and (has := wanted & set(font.get_charmap())):
-                fontManager.addfont(path)  # it may be newer than the list that matplotlib keeps
-                families.append(name)
-                wanted -= has
-    return families
-
-
-@lru_cache
-def _tell_boxes(letters: str) -> None:
-    """Once, for there are many plots."""
-    log.warning('plots show boxes in place of %s: install a font that has these letters, for example fonts-noto-cjk',
-                letters)
 
 
 def _figure(width: float, height: float, columns: int = 1) -> tuple[Figure, NDArray[np.object_]]:

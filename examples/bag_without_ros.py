@@ -5,6 +5,7 @@
 """
 
 import csv
+import os
 import sys
 
 from hand_pose_ros.bags import DepthBag
@@ -23,6 +24,7 @@ def main() -> None:
                 for name, point, confidence in zip(hand.joint_names, hand.joints, hand.confidence, strict=True):
                     table.writerow([frame.stamp_ns, frame.frame_id, hand.id, hand.side, name,
                                     *(f'{value:.4f}' for value in point), f'{confidence:.2f}'])
+    sys.stdout.flush()
 
 
 if __name__ == '__main__':
@@ -30,5 +32,7 @@ if __name__ == '__main__':
         sys.exit(__doc__)
     try:
         main()
+    except BrokenPipeError:  # nobody reads on, as after | head
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except HandPoseError as error:
         sys.exit(str(error))

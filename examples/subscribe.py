@@ -8,6 +8,7 @@ It needs ROS 2, for example from pip install '.[ros]'. If there is only compress
 the node with --ros-args -p transport:=compressedDepth.
 """
 
+import os
 import sys
 
 import rclpy
@@ -16,6 +17,7 @@ from rclpy.node import Node
 
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.msg import HandJoints, HandJointsArray
+from hand_pose_ros.ros import init
 from hand_pose_ros.skeleton import get_skeleton
 
 SIDES = {HandJoints.LEFT: 'left', HandJoints.RIGHT: 'right', HandJoints.UNKNOWN: 'unknown'}
@@ -41,11 +43,13 @@ class Listener(Node):
 
 
 def main() -> None:
-    rclpy.init()
+    init()  # rclpy.init(), whose errors it explains
     try:
         rclpy.spin(Listener())
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
+    except BrokenPipeError:  # nobody reads on, as after | head
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except HandPoseError as error:
         sys.exit(f'hand/joints: {error}')
     finally:
@@ -53,4 +57,7 @@ def main() -> None:
 
 
 if __name__ == '__main__':
-    main()
+    try:
+        main()
+    except HandPoseError as error:
+        sys.exit(str(error))

@@ -202,6 +202,25 @@ def test_subscribe(ros_domain: int, tmp_path: Path) -> None:
               lambda: wanted in said.read_text())
 
 
+def test_examples_end_without_a_word_when_nobody_reads_on(ros_domain: int, film: Film, tmp_path: Path) -> None:
+    """As after `| head`."""
+    write_bag(tmp_path / 'film.mcap', film)
+    command = [sys.executable, EXAMPLES / 'bag_without_ros.py', tmp_path / 'film.mcap']
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        process.stdout.close()
+        assert process.wait(timeout=60) == 0 and process.stderr.read() == b''
+    pytest.importorskip('hand_pose_ros.msg', reason='needs ROS 2 and the compiled messages')
+    command = [sys.executable, EXAMPLES / 'subscribe.py']
+    with publishing() as (_, until), subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        process.stdout.close()
+        try:
+            until(hands_message(pose()), lambda: process.poll() is not None)
+        finally:
+            process.kill()
+        assert process.returncode == 0 and process.stderr.read() == b''
+
+
 def test_gripper(ros_domain: int, tmp_path: Path) -> None:
     pytest.importorskip('hand_pose_ros.msg', reason='needs ROS 2 and the compiled messages')
     from std_msgs.msg import Float64MultiArray

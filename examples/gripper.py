@@ -9,14 +9,19 @@ and then the one with the highest score. Without a hand that it can trust, the g
 that the gripper is open at the start: open it first.
 """
 
+import sys
+
 import numpy as np
 import rclpy
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
 
 from hand_pose_ros.angles import ANGLES, finger_angles
+from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.msg import HandJoints, HandJointsArray
+from hand_pose_ros.ros import init
 from hand_pose_ros.skeleton import HAND21
 
 SIDES = {HandJoints.LEFT: 'left', HandJoints.RIGHT: 'right'}
@@ -36,7 +41,10 @@ def closing(joints: np.ndarray, side: str) -> float:
 class Gripper(Node):
     def __init__(self) -> None:
         super().__init__('gripper')
-        self.max_opening = self.declare_parameter('max_opening', 0.08).value
+        descriptor = ParameterDescriptor(dynamic_typing=True, read_only=True)  # 1 is as good as 1.0
+        self.max_opening = self.declare_parameter('max_opening', 0.08, descriptor).value
+        if type(self.max_opening) not in (int, float) or not 0 < self.max_opening < np.inf:
+            raise InputError(f'max_opening is {self.max_opening!r}: give metres, such as 0.08')
         self.opening, self.moved = self.max_opening, self.get_clock().now()
         self.followed = ''  # id of a hand
         self.commands = self.create_publisher(Float64MultiArray, 'gripper/commands', 10)
@@ -65,7 +73,7 @@ class Gripper(Node):
 
 
 def main() -> None:
-    rclpy.init()
+    init()  # rclpy.init(), whose errors it explains
     try:
         rclpy.spin(Gripper())
     except (KeyboardInterrupt, ExternalShutdownException):
@@ -75,4 +83,7 @@ def main() -> None:
 
 
 if __name__ == '__main__':
-    main()
+    try:
+        main()
+    except HandPoseError as error:
+        sys.exit(str(error))

@@ -238,6 +238,17 @@ def test_gripper(ros_domain: int, tmp_path: Path) -> None:
         assert opening[-1] < 0.005, 'a hand that cannot be trusted moves nothing'
 
 
+@pytest.mark.parametrize('opening, said', [
+    ('', 'ROS cannot be used'), (':=wide', "'wide'"), (':=-0.1', '-0.1'), (':=.nan', 'nan')])
+def test_gripper_names_an_opening_that_cannot_be_used(
+        opening: str, said: str, ros_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip('hand_pose_ros.msg', reason='needs ROS 2 and the compiled messages')
+    monkeypatch.setattr(sys, 'argv', ['gripper.py', '--ros-args', '-p', f'max_opening{opening}'])
+    with pytest.raises(SystemExit, match=f'.*{said}.*') as end:
+        runpy.run_path(str(EXAMPLES / 'gripper.py'), run_name='__main__')
+    assert '\n' not in str(end.value)
+
+
 @pytest.fixture
 def gripper(ros_domain: int) -> Iterator[Any]:
     """The node of gripper.py, open by 0.1 m and in simulated time; its commands are in `openings`."""

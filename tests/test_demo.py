@@ -114,5 +114,7 @@ def test_ctrl_c_is_one_sentence(ros_domain: int, tmp_path: Path) -> None:
                           stderr=subprocess.STDOUT, text=True) as process:
         next(line for line in process.stdout if 'listening to' in line)
         process.send_signal(signal.SIGINT)
-        assert process.stdout.read().strip() == 'hand-pose demo: interrupted'
+        # ROS itself may tell that it could not publish that line any more.
+        said = [line for line in process.stdout.read().splitlines() if 'log message to rosout' not in line]
+        assert said == ['hand-pose demo: interrupted']
     assert process.returncode == 1

@@ -145,6 +145,20 @@ def test_profiles_of_the_middleware(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert lines()[0].startswith('note') and '512 kB, too small' in lines()[0]
 
 
+@pytest.mark.parametrize('distro, version, name', [
+    ('jazzy', '9.1.2', 'FASTRTPS_DEFAULT_PROFILES_FILE'), ('kilted', '7.1.5', 'FASTDDS_DEFAULT_PROFILES_FILE'),
+    (None, '7.1.5', 'FASTRTPS_DEFAULT_PROFILES_FILE'), (None, '9.1.2', 'FASTDDS_DEFAULT_PROFILES_FILE')])
+def test_the_variable_is_that_of_the_release_from_wheels_too(distro: str | None, version: str, name: str,
+                                                             monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip('rclpy', reason='needs ROS 2')
+    from hand_pose_ros.ros import qos
+    monkeypatch.delenv('ROS_DISTRO', raising=False)
+    if distro:
+        monkeypatch.setenv('ROS_DISTRO', distro)
+    monkeypatch.setattr(qos, 'version', lambda package: version)
+    assert qos.large_image_profile()[0] == name
+
+
 def test_too_little_shared_memory(weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
                                   capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip('rclpy', reason='needs ROS 2')

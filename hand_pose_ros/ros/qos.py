@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from importlib.metadata import version
 
 from rclpy import get_rmw_implementation_identifier
 from rclpy.qos import QoSDurabilityPolicy, QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
@@ -26,6 +27,8 @@ def sensor() -> QoSProfile:
     return QoSProfile(history=QoSHistoryPolicy.KEEP_LAST, depth=1, reliability=QoSReliabilityPolicy.BEST_EFFORT)
 
 
+KILTED = 9
+"""Major version of its rclpy."""
 PROFILE_VARIABLES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')  # the second up to Jazzy
 
 
@@ -41,8 +44,10 @@ def large_image_profile() -> tuple[str, str]:
     Without the profile, a VGA depth image is larger than this memory, and a best-effort subscriber loses many images.
     """
     new, old = PROFILE_VARIABLES
-    name = old if os.environ.get('ROS_DISTRO') in ('humble', 'iron', 'jazzy') else new
-    return name, str(resource('config/fastdds_large_images.xml'))
+    distro = os.environ.get('ROS_DISTRO')  # not set with ROS from wheels
+    up_to_jazzy = (distro in ('humble', 'iron', 'jazzy') if distro
+                   else int(version('rclpy').partition('.')[0]) < KILTED)
+    return old if up_to_jazzy else new, str(resource('config/fastdds_large_images.xml'))
 
 
 def let_large_images_through() -> None:

@@ -94,6 +94,7 @@ def measure(rate: float, seconds: float, reliability: str, parameters: list[str]
     from diagnostic_msgs.msg import DiagnosticArray
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.qos import QoSProfile, ReliabilityPolicy
+    from rclpy.task import Future
     from sensor_msgs.msg import CameraInfo, Image
 
     from hand_pose_ros.conventions import stamp_ns
@@ -118,7 +119,8 @@ def measure(rate: float, seconds: float, reliability: str, parameters: list[str]
     node.create_subscription(DiagnosticArray, '/diagnostics', on_diagnostics, QoSProfile(depth=10))
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    thread = threading.Thread(target=executor.spin, daemon=True)
+    done: Future[None] = Future()
+    thread = threading.Thread(target=executor.spin_until_future_complete, args=(done,), daemon=True)
     thread.start()
 
     arguments = [item for each in ('min_score:=0.0', *parameters) for item in ('-p', each)]
@@ -147,8 +149,9 @@ def measure(rate: float, seconds: float, reliability: str, parameters: list[str]
     finally:
         process.send_signal(signal.SIGINT)
         process.wait(timeout=20)
-        executor.shutdown()
+        done.set_result(None)  # to shut down the executor first would destroy what its thread waits with
         thread.join()
+        executor.shutdown()
         node.destroy_node()
         rclpy.try_shutdown()
     latency = np.array([received[stamp] - at for stamp, at in sent.items() if stamp in received]) * 1e3

@@ -27,6 +27,7 @@ from lifecycle_msgs.srv import ChangeState
 from node_latency import COMMAND, FOCAL, HEIGHT, WIDTH, environment, hand_image
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
+from rclpy.task import Future
 from sensor_msgs.msg import CameraInfo, Image
 from tqdm import tqdm
 
@@ -61,7 +62,9 @@ class Rig:
         self._newest = self._sent = 0
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
-        self._thread = threading.Thread(target=self._executor.spin, daemon=True)
+        self._done: Future[None] = Future()
+        self._thread = threading.Thread(
+            target=self._executor.spin_until_future_complete, args=(self._done,), daemon=True)
         self._thread.start()
         self.process: subprocess.Popen[bytes] | None = None
 
@@ -127,8 +130,9 @@ class Rig:
         """Leave nothing running."""
         if self.process is not None and self.process.poll() is None:
             self.process.kill()
-        self._executor.shutdown()
+        self._done.set_result(None)  # to shut down the executor first would destroy what its thread waits with
         self._thread.join(timeout=5)
+        self._executor.shutdown()
         self.node.destroy_node()
 
     def _on_joints(self, hands: HandJointsArray) -> None:

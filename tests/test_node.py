@@ -28,6 +28,7 @@ from rclpy.node import Node  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from rclpy.parameter_client import AsyncParameterClient  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
+from rclpy.task import Future  # noqa: E402
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image  # noqa: E402
 from std_srvs.srv import SetBool, Trigger  # noqa: E402
 from visualization_msgs.msg import Marker, MarkerArray  # noqa: E402
@@ -113,7 +114,7 @@ class Rig:
         self.listen(MarkerArray, 'hand/markers', RELIABLE)
         self.listen(DiagnosticArray, '/diagnostics', RELIABLE)
         self.listen(Log, '/rosout', QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL))
-        self.executors, self.threads = [], []
+        self.executors, self.threads, self.done = [], [], Future()
         self.node: EstimatorNode | None = None
         self.spin(self.client)
 
@@ -123,7 +124,7 @@ class Rig:
     def spin(self, node: Node) -> None:
         executor = SingleThreadedExecutor(context=self.context)
         executor.add_node(node)
-        thread = threading.Thread(target=executor.spin, daemon=True)
+        thread = threading.Thread(target=executor.spin_until_future_complete, args=(self.done,), daemon=True)
         thread.start()
         self.executors.append(executor)
         self.threads.append(thread)
@@ -205,10 +206,11 @@ class Rig:
         return result.successful, result.reason
 
     def close(self) -> None:
-        for executor in self.executors:
-            executor.shutdown()
+        self.done.set_result(None)  # to shut down the executor first would destroy what its thread waits with
         for thread in self.threads:
             thread.join()
+        for executor in self.executors:
+            executor.shutdown()
         for node in (self.node, self.client):
             if node is not None:
                 node.destroy_node()

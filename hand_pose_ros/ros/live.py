@@ -21,6 +21,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
 from sensor_msgs.msg import CompressedImage, Image
 
 from hand_pose_ros.bags import DepthBag
@@ -158,13 +159,15 @@ class _Listener:
 def _listening(namespace: str, depth_topic: str, image_type: type) -> Iterator[_Listener]:
     listener, executor = _Listener(namespace, depth_topic, image_type), SingleThreadedExecutor()
     executor.add_node(listener.node)
-    thread = threading.Thread(target=executor.spin, daemon=True)
+    done: Future[None] = Future()
+    thread = threading.Thread(target=executor.spin_until_future_complete, args=(done,), daemon=True)
     thread.start()
     try:
         yield listener
     finally:
-        executor.shutdown()
+        done.set_result(None)  # to shut down the executor first would destroy what its thread waits with
         thread.join(timeout=5)
+        executor.shutdown()
         listener.node.destroy_node()
 
 

@@ -6,6 +6,10 @@ from typing import Any
 
 TRANSPORTS = ('raw', 'compressedDepth', 'compressed')
 """The better transports first. All but raw have a topic below that of the image (image_transport)."""
+ZSTD = 'zstd'
+"""A transport that is not read."""
+ZSTD_REMEDY = (f'the transport {ZSTD} is not read: convert it with ros2 run image_transport republish '
+               f'(in_transport {ZSTD}, out_transport raw), or publish or record another transport')
 CROP = 'debug/crop'
 """The topic, below the name of the node, of what the network sees. It has an encoding of depth, but is not depth."""
 

@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hand_pose_ros.conventions import ZSTD, ZSTD_REMEDY
 from hand_pose_ros.errors import InputError, naming
 
 DEPTH_ENCODINGS: dict[str, np.dtype[Any]] = {
@@ -86,6 +87,8 @@ def decode_compressed(msg: Any, depth_scale: float = 0.001, *, source: str = '')
     with naming(source):
         words = msg.format.replace(';', ' ').split()
         encoding = words[0] if words else ''
+        if encoding == ZSTD:
+            raise InputError(ZSTD_REMEDY)
         if encoding not in DEPTH_ENCODINGS:
             raise InputError(f'the format {msg.format!r:.80} is not compressed depth: choose a topic whose format '
                              f"begins with {', '.join(DEPTH_ENCODINGS)} (such as '16UC1; compressedDepth png')")

@@ -170,6 +170,17 @@ def test_a_bag_without_depth_is_refused(tmp_path, depths):
         DepthBag(write_ros1(tmp_path / 'colour.bag', depths, encoding='bgr8'))
 
 
+def test_a_transport_that_is_not_read_is_named(tmp_path):
+    topic, image, types = '/depth/image/zstd', 'sensor_msgs/msg/CompressedImage', typestore().types
+    with BagWriter(tmp_path / 'zstd.mcap') as bag:
+        bag.write(topic, image, types[image](bag._header(10**9, 'camera'), 'zstd', np.zeros(20, np.uint8)), 10**9)
+    with pytest.raises(InputError, match=rf'zstd\.mcap: .* of {topic} the transport zstd is not read: convert it with'):
+        DepthBag(tmp_path / 'zstd.mcap')
+    with DepthBag(tmp_path / 'zstd.mcap', topic, intrinsics=(1, 1, 0, 0)) as bag, pytest.raises(
+            InputError, match=f'^{topic}: the transport zstd is not read: convert it with'):
+        _ = next(iter(bag)).depth
+
+
 def test_of_several_depth_topics_one_must_be_chosen(tmp_path, depths):
     with BagWriter(tmp_path / 'two.mcap') as bag:
         for name in ('left', 'right'):

@@ -678,6 +678,13 @@ def test_who_has_just_come_is_not_said_to_be_missing(rig: Rig, monkeypatch: pyte
               'the publisher to be seen, and given its time')
 
 
+def test_a_transport_that_is_not_read_is_named(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(node_module, 'SILENCE_S', 0.1)
+    rig.client.create_publisher(CompressedImage, 'depth/image_rect/zstd', RELIABLE)
+    rig.start()
+    rig.until_said('on /depth/image_rect/zstd there are images: the transport zstd is not read: convert it with')
+
+
 def test_depth_that_is_only_raw_is_found(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(node_module, 'SILENCE_S', 0.1)
     rig.client.create_publisher(Image, 'depth/image_rect', RELIABLE)

@@ -14,7 +14,16 @@ from numpy.typing import NDArray
 from rosbags.interfaces import Connection
 
 from hand_pose_ros.bags.bag import CAMERA_INFO, COMPRESSED_IMAGE, HANDS, IMAGE, SIDES, Bag
-from hand_pose_ros.conventions import CROP, TRANSPORTS, camera_info_beside, join_transport, split_transport, stamp_ns
+from hand_pose_ros.conventions import (
+    CROP,
+    TRANSPORTS,
+    ZSTD,
+    ZSTD_REMEDY,
+    camera_info_beside,
+    join_transport,
+    split_transport,
+    stamp_ns,
+)
 from hand_pose_ros.depth import DEPTH_ENCODINGS, decode_compressed, decode_image
 from hand_pose_ros.errors import InputError, naming
 from hand_pose_ros.geometry import Intrinsics
@@ -147,6 +156,9 @@ class DepthBag(Bag):
             return topics[0]
         if topics:
             raise InputError(f'{self.path}: several topics carry depth: choose one of {", ".join(topics)}')
+        if zstd := sorted(c.topic for c in self.connections if c.topic.endswith(f'/{ZSTD}')):
+            raise InputError(f'{self.path}: no topic carries depth that can be read, and of {", ".join(zstd)} '
+                             f'{ZSTD_REMEDY}')
         raise InputError(f'{self.path}: no topic carries depth, as images in {", ".join(DEPTH_ENCODINGS)} or '
                          f'compressedDepth do: choose another bag (this one has {self._topics()})')
 

@@ -12,7 +12,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from hand_pose_ros.conventions import TRANSPORTS, camera_info_beside, join_transport, split_transport
+from hand_pose_ros.conventions import TRANSPORTS, ZSTD, ZSTD_REMEDY, camera_info_beside, join_transport, split_transport
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.ros import qos
 
@@ -107,13 +107,17 @@ def explain_silence(node: Node, topic: str, message_type: type, seconds: float) 
     topic_type = f'sensor_msgs/msg/{message_type.__name__}'
     said = f'no image arrived on {topic} for {seconds:.0f} s; the topic is {describe_publishers(node, topic)}'
     infos = node.get_publishers_info_by_topic(topic)
+    image, _ = split_transport(topic)
     if not infos:
-        image, _ = split_transport(topic)
         for transport in TRANSPORTS:
             other = join_transport(image, transport)
             if other != topic and node.count_publishers(other):
                 return (f'{said}, but depth is published on {other}: set the parameter transport to {transport} '
                         f'(at the start: --ros-args -p transport:={transport})')
+    zstd = f'{image.removesuffix(f"/{ZSTD}")}/{ZSTD}'
+    if all(info.topic_type != topic_type for info in infos) and node.count_publishers(zstd):
+        return f'{said}, but on {zstd} there are images: {ZSTD_REMEDY}'
+    if not infos:
         ours = {topic, *(publisher.topic_name for publisher in node.publishers)}
         others = [name for name, types in node.get_topic_names_and_types() if topic_type in types and name not in ours]
         where = f' ({topic_type} is published on {", ".join(others)})' if others else ''

@@ -8,8 +8,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from hand_pose_ros.errors import HandPoseError
-
 Terms = dict[str, Tensor]
 """Scalars by name; their sum is minimised."""
 
@@ -26,17 +24,12 @@ def joint_loss(kind: str, knee: float, joints: Tensor, truth: Tensor, counts: Te
         knee: where huber and smooth_l1 go over from squared to linear, cube units.
         joints: (B, J, 3); `truth` likewise, cube units.
         counts: (B,) bool, the samples that count.
-
-    Raises:
-        HandPoseError: unknown kind.
     """
     if kind == 'huber':
         distance = torch.sqrt((joints - truth).square().sum(-1) + 1e-12)  # the root has no gradient at 0
         loss = F.huber_loss(distance, torch.zeros_like(distance), reduction='none', delta=knee).sum(-1)
     elif kind == 'squared':
         loss = (joints - truth).square().sum((-2, -1))
-    elif kind == 'smooth_l1':
-        loss = F.smooth_l1_loss(joints, truth, reduction='none', beta=knee).mean((-2, -1))
     else:
-        raise HandPoseError(f"unknown loss '{kind}': choose huber, squared or smooth_l1")
+        loss = F.smooth_l1_loss(joints, truth, reduction='none', beta=knee).mean((-2, -1))
     return (loss * counts).mean()

@@ -160,12 +160,15 @@ def test_truth_that_does_not_fit_is_refused(tmp_path, bag, model, result, capsys
     np.savez(tmp_path / 'late.npz', joints=result.predictions, stamps_ns=result.stamps_ns + 10**12)
     np.savez(tmp_path / 'odd.npz', wrong=np.zeros(3))
     np.savez(tmp_path / 'stamps.npz', joints=result.predictions, stamps_ns=result.stamps_ns[:-1])
+    np.savez(tmp_path / 'none.npz', joints=result.predictions[:0], stamps_ns=result.stamps_ns[:0])
+    np.savez(tmp_path / 'one.npz', joints=3.0, stamps_ns=result.stamps_ns)
     np.save(tmp_path / 'array.npy', np.zeros(3))
     (tmp_path / 'array.npy').rename(tmp_path / 'array.npz')
     for source, message in (
             (tmp_path / 'few.npz', '3 labels for 12 images'), (tmp_path / 'nyu.npz', r'shape (12, 14, 3)'),
             (tmp_path / 'late.npz', 'no label is within 10 ms'), (tmp_path / 'odd.npz', 'array joints'),
             (tmp_path / 'stamps.npz', 'stamps_ns of shape (11,) for 12 labels'),
+            (tmp_path / 'none.npz', 'there is no label in it'), (tmp_path / 'one.npz', 'the truth has the shape ()'),
             (tmp_path / 'array.npz', 'array joints'),
             ('/truth/joints', 'HandJointsArray named /truth/joints'), ('truth.csv', 'no such file')):
         assert main(arguments(bag, model, '--ground-truth', source)) == 1

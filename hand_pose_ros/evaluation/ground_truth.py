@@ -53,6 +53,11 @@ def read_truth(source: str, bag: str | Path, skeleton: Skeleton) -> Truth:
         if len(shape) != 3 or shape[1:] != expected:
             raise InputError(f'{source}: the truth has the shape {shape}, but the joints of the estimator '
                              f'({skeleton.name}) need (frames, {expected[0]}, 3)')
+        if not len(truth.joints):
+            raise InputError(f'{source}: there is no label in it')
+        if truth.stamps_ns is not None and truth.stamps_ns.shape != shape[:1]:
+            raise InputError(f'{source}: stamps_ns of shape {truth.stamps_ns.shape} for {shape[0]} labels: give one '
+                             'for each')
     return truth
 
 
@@ -95,8 +100,6 @@ def _read(source: str, bag: str | Path, skeleton: Skeleton) -> Truth:
             stamps, joints = file.get('stamps_ns'), file['joints'].astype(np.float64)
     except (OSError, *DAMAGE):
         raise InputError(f'{source}: not an .npz file with an array joints (frames, joints, 3) in metres') from None
-    if stamps is not None and stamps.shape != (len(joints),):
-        raise InputError(f'{source}: stamps_ns of shape {stamps.shape} for {len(joints)} labels: give one for each')
     return Truth(source, joints, stamps)
 
 
@@ -129,15 +132,14 @@ def _match(stamps: NDArray[np.int64], joints: Joints, result: Result, source: st
     right = np.searchsorted(stamps, result.stamps_ns).clip(1, max(1, len(stamps) - 1))
     candidates = np.stack([right - 1, right.clip(max=len(stamps) - 1)])
     distances = np.abs(stamps[candidates] - result.stamps_ns)
-    nearest = np.take_along_axis(candidates, distances.argmin(0)[None], 0)[0]
-    near = distances.min(0) <= TOLERANCE_NS
-    by_label = np.lexsort((distances.min(0), nearest))
-    nearest_image = np.zeros_like(near)
-    nearest_image[by_label[np.unique(nearest[by_label], return_index=True)[1]]] = True
-    if not near.any():
+    label, distance = np.take_along_axis(candidates, distances.argmin(0)[None], 0)[0], distances.min(0)
+    if distance.min() > TOLERANCE_NS:
         raise InputError(f'{source}: no label is within {TOLERANCE_NS / 1e6:.0f} ms of an image: the nearest is '
-                         f'{distances.min() / 1e9:.3f} s away; are the stamps of the same clock?')
-    truth = np.full((len(near), *joints.shape[1:]), np.nan)
-    near &= nearest_image
-    truth[near] = joints[nearest[near]]
+                         f'{distance.min() / 1e9:.3f} s away; are the stamps of the same clock?')
+    # Of the images that have the same nearest label, the nearest image gets it.
+    by_label = np.lexsort((distance, label))
+    images = by_label[np.unique(label[by_label], return_index=True)[1]]
+    images = images[distance[images] <= TOLERANCE_NS]
+    truth = np.full((len(distance), *joints.shape[1:]), np.nan)
+    truth[images] = joints[label[images]]
     return truth

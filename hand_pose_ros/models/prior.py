@@ -140,15 +140,6 @@ def _set_reconstruction(layer: nn.Linear | None, mean: ArrayLike, components: Ar
         layer.bias.copy_(bias)
 
 
-def relu_conv(inputs: int, outputs: int, size: int, stride: int = 1, padding: int = 0,
-              groups: int = 1) -> nn.Conv2d:
-    """A convolution before a ReLU: N(0, sqrt(2 / fan_in)), zero bias (He et al. 2015)."""
-    layer = nn.Conv2d(inputs, outputs, size, stride, padding, groups=groups)
-    nn.init.kaiming_normal_(layer.weight, nonlinearity='relu')
-    nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
-    return layer
-
-
 def relu_linear(inputs: int, outputs: int) -> nn.Linear:
     """A fully connected layer before a ReLU: N(0, 0.01), zero bias (original code)."""
     layer = nn.Linear(inputs, outputs)

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from hand_pose_ros.geometry import PATCH_SIZE
-from hand_pose_ros.models.prior import PoseHead, relu_conv
+from hand_pose_ros.models.prior import PoseHead
 
 
 class PoseNetwork(nn.Module):
@@ -55,7 +55,7 @@ class Deep(PoseNetwork):
     """Three convolutions and two hidden layers (original code); with a bottleneck of 30 it is Deep-Prior."""
 
     def __init__(self, joints: int = 21, bottleneck: int | None = None, dropout: float = 0.3) -> None:
-        super().__init__(nn.Sequential(*deep_branch((4, 2, 1))), joints, bottleneck, dropout=dropout)
+        super().__init__(nn.Sequential(*_deep_branch((4, 2, 1))), joints, bottleneck, dropout=dropout)
 
 
 class MultiScale(PoseNetwork):
@@ -83,7 +83,7 @@ class _Branches(nn.Module):
         super().__init__()
         self.views = views
         self.branches = nn.ModuleList(
-            nn.Sequential(*deep_branch(pools)) for pools in ((4, 2, 1), (2, 2, 1), (2, 1, 1)))
+            nn.Sequential(*_deep_branch(pools)) for pools in ((4, 2, 1), (2, 2, 1), (2, 1, 1)))
 
     def forward(self, patch: Tensor) -> Tensor:  # (B, 1, 128, 128) -> (B, 968 + 968 + 512)
         views = self.views(patch)
@@ -99,7 +99,7 @@ def _central_crops(patch: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return patch, patch[..., 32:96, 32:96], patch[..., 48:80, 48:80]
 
 
-def deep_branch(pools: tuple[int, int, int]) -> list[nn.Module]:
+def _deep_branch(pools: tuple[int, int, int]) -> list[nn.Module]:
     """The convolutions of Deep: 8@5x5, 8@5x5, 8@3x3, each pooled and rectified, then flattened."""
     sizes = zip((1, 8, 8), (5, 5, 3), pools, strict=True)
     return [*(_convolution(inputs, 8, size, pool) for inputs, size, pool in sizes), nn.Flatten()]
@@ -109,3 +109,12 @@ def _convolution(inputs: int, outputs: int, size: int, pool: int) -> nn.Sequenti
     """Convolution, pooling, ReLU. The bias commutes with max-pooling, so adding it before changes nothing."""
     pooling = [nn.MaxPool2d(pool)] if pool > 1 else []
     return nn.Sequential(relu_conv(inputs, outputs, size), *pooling, nn.ReLU())
+
+
+def relu_conv(inputs: int, outputs: int, size: int, stride: int = 1, padding: int = 0,
+              groups: int = 1) -> nn.Conv2d:
+    """A convolution before a ReLU: N(0, sqrt(2 / fan_in)), zero bias (He et al. 2015)."""
+    layer = nn.Conv2d(inputs, outputs, size, stride, padding, groups=groups)
+    nn.init.kaiming_normal_(layer.weight, nonlinearity='relu')
+    nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
+    return layer

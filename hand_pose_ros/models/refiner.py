@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from hand_pose_ros.geometry import PATCH_SIZE
-from hand_pose_ros.models.prior import relu_conv
+from hand_pose_ros.models.prior_net import relu_conv
 
 
 class Layer(NamedTuple):

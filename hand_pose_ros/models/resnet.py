@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor, nn
 
-from hand_pose_ros.models.prior import relu_conv
-from hand_pose_ros.models.prior_net import PoseNetwork
+from hand_pose_ros.models.prior_net import PoseNetwork, relu_conv
 
 
 class ResNet(PoseNetwork):

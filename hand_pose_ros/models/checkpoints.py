@@ -82,12 +82,12 @@ def load_checkpoint(name_or_path: str | PathLike[str] | None = None) -> Checkpoi
     metadata, tensors = _read(path)
     network = _restore(path, 'network', metadata, tensors)
     refiner = _restore(path, 'refiner', metadata['refiner'], tensors) if 'refiner' in metadata else None
+    try:
+        skeleton = get_skeleton(metadata['skeleton'])
+    except HandPoseError as error:
+        raise CheckpointError(f'checkpoint {path}: {error}') from error
     for part in (metadata, metadata.get('refiner', {})):
         joints = part.get('config', {}).get('joints')
-        try:
-            skeleton = get_skeleton(metadata['skeleton'])
-        except HandPoseError as error:
-            raise CheckpointError(f'checkpoint {path}: {error}') from error
         if joints not in (None, len(skeleton)):
             raise CheckpointError(f"checkpoint {path} predicts {joints} joints, "
                                   f"but its skeleton '{skeleton.name}' has {len(skeleton)}")

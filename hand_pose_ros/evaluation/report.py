@@ -115,16 +115,15 @@ def _cards(result: Result, read_depths: ReadDepths | None) -> list[_Card]:
         center = np.nanmean(known, axis=0)
         cube = Cube.at(center, _VIEW_SIDE_M)
         depth = depths.get(row)
-        picture, kind = '', 'blind'
-        if depth is not None:
-            panels = []
-            for name, joints in (('estimate', estimate), ('truth', truth)):
-                if np.isfinite(joints).all():
-                    panels.append(close_up(depth, result.intrinsics, cube, joints, result.skeleton))
-                    caption(panels[-1], name)
-            kind = ('blind', 'single', '')[len(panels)]
-            picture = '' if not panels else _data_image('png', cv2.imencode('.png', np.hstack(panels))[1].tobytes(),
-                                  'joints on the depth image: estimate' + (', truth' if len(panels) > 1 else ''))
+        panels = []
+        for name, joints in (('estimate', estimate), ('truth', truth)):
+            if depth is not None and np.isfinite(joints).all():
+                panels.append(close_up(depth, result.intrinsics, cube, joints, result.skeleton))
+                caption(panels[-1], name)
+        kind = ('blind', 'single', '')[len(panels)]
+        picture = '' if not panels else _data_image(
+            'png', cv2.imencode('.png', np.hstack(panels))[1].tobytes(),
+            'joints on the depth image: estimate' + (', truth' if len(panels) > 1 else ''))
         cards.append(_Card(
             f'<div class="frame {kind}"><h3>{escape(title)}</h3>{picture}'
             f'<canvas data-view="{len(cards)}" aria-label="3D view"></canvas></div>',

@@ -263,13 +263,13 @@ def judge(found: Look, engine: Engine, progress: Progress) -> Numbers:
         scores = [explain(patch, joints, float(side), HAND21)[1] for patch, joints, side in
                   zip(crops['patch'].numpy(), crops['joints'].numpy(), crops['cube_side'], strict=True)]
         own = {'disagreement_mm': 1000 * float(spread.mean()), 'explained': float(np.mean(scores))}
-    whole = found.result
-    assert whole.stamps_ns is not None
-    part = replace(whole, predictions=whole.predictions[held], stamps_ns=whole.stamps_ns[held], seconds={}, info={},
-                   hand_ids=None if whole.hand_ids is None else whole.hand_ids[held],
-                   truth=None if whole.truth is None else whole.truth[held]).summary()
-    return {'found': part['detection_rate'], 'error_mm': part.get('mean_mm'), **own,
-            'jitter_mm': part['jitter_mm'], 'bone_drift_mm': part['bone_drift_mm']}
+    result = found.result
+    assert result.stamps_ns is not None
+    summary = replace(result, predictions=result.predictions[held], stamps_ns=result.stamps_ns[held], seconds={},
+                      info={}, hand_ids=None if result.hand_ids is None else result.hand_ids[held],
+                      truth=None if result.truth is None else result.truth[held]).summary()
+    return {'found': summary['detection_rate'], 'error_mm': summary.get('mean_mm'), **own,
+            'jitter_mm': summary['jitter_mm'], 'bone_drift_mm': summary['bone_drift_mm']}
 
 
 def is_better(before: Numbers, after: Numbers) -> bool:
@@ -278,14 +278,13 @@ def is_better(before: Numbers, after: Numbers) -> bool:
     The truth decides where it is known. Else the answers must agree better and explain the depth no worse: agreement
     alone is what is trained, and would come from a network that always says the same.
     """
-    def error(name: str) -> bool:
-        """Whether it is smaller than it was."""
+    def smaller(name: str) -> bool:
         now, was = after[name], before[name]
         return now is not None and was is not None and now < was
 
-    def share(name: str, slack: float) -> bool:
+    def kept(name: str, slack: float) -> bool:
         return (after[name] or 0) >= (before[name] or 0) - slack
 
     if before['error_mm'] is not None:
-        return share('found', 0.01) and error('error_mm')
-    return share('found', 0.01) and error('disagreement_mm') and share('explained', 0.005)
+        return kept('found', 0.01) and smaller('error_mm')
+    return kept('found', 0.01) and smaller('disagreement_mm') and kept('explained', 0.005)

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from torch import nn
 
 from hand_pose_ros.datasets import Batch, joints_in_metres
 from hand_pose_ros.errors import HandPoseError
@@ -32,7 +31,7 @@ from hand_pose_ros.skeleton import Skeleton, get_skeleton
 from hand_pose_ros.training import figures
 from hand_pose_ros.training.folder import RunFolder
 from hand_pose_ros.training.loop import Machine, Run, open_shards
-from hand_pose_ros.training.recipes import Recipe
+from hand_pose_ros.training.recipes import Recipe, recipe_to_dict
 from hand_pose_ros.training.state import load_progress
 from hand_pose_ros.training.validation import estimate, some_samples
 
@@ -152,7 +151,7 @@ class Laboratory:
 
     def write(self, name: str, table: str, values: dict[str, Any], figure: Figure) -> str:
         """NAME.json, NAME.md, NAME.png and NAME.svg; returns the table."""
-        write_json(self.folder / f'{name}.json', {'recipe': dataclasses.asdict(self.recipe), **values})
+        write_json(self.folder / f'{name}.json', {'recipe': recipe_to_dict(self.recipe), **values})
         write_bytes(self.folder / f'{name}.md', table.encode())
         plots.save(figure, self.folder / name)
         return table
@@ -238,16 +237,13 @@ def runtime(lab: Laboratory) -> str:
     from hand_pose_ros.runtime.engine import Pipeline, TorchEngine
     from hand_pose_ros.runtime.timing import measure
 
-    def made(name: str) -> tuple[nn.Module, nn.Module | None]:
-        first, _, refiner = name.partition(' + ')
-        architecture, _, width = first.partition('-')
-        return (build(architecture, bottleneck=int(width) if width else None),
-                build(refiner) if refiner else None)
-
     patch = lab.test[0]['patch'][:1].float().numpy()
     calls: dict[str, Callable[[], Any]] = {}
     for name in PAPER_MS:
-        network, refiner = made(name)
+        first, _, second = name.partition(' + ')
+        architecture, _, width = first.partition('-')
+        network = build(architecture, bottleneck=int(width) if width else None)
+        refiner = build(second) if second else None
         calls[f'{name}|eager'] = partial(TorchEngine(Pipeline(network, refiner).eval()).run, patch)
         calls[f'{name}|fast'] = partial(make_engine(network, 'cpu', refiner=refiner).run, patch)
     rows = measure(calls, ROUNDS)

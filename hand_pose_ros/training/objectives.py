@@ -85,8 +85,8 @@ class DenseObjective(PoseObjective):
         joints, refined = out['joints'].float(), out['unrefined'] is not out['joints']
         directions, closeness = encode(out['positions'], truth)
         seen = out['seen']  # (B, 1, 32, 32)
-        apart = partial(F.smooth_l1_loss, reduction='none', beta=self.recipe.knee)
-        maps = (apart(out['closeness'], closeness) + apart(out['directions'], directions).mean(2)) * seen
+        smooth_l1 = partial(F.smooth_l1_loss, reduction='none', beta=self.recipe.knee)
+        maps = (smooth_l1(out['closeness'], closeness) + smooth_l1(out['directions'], directions).mean(2)) * seen
         maps = maps.mean(1).sum((1, 2)) / seen.sum((1, 2, 3)).clamp(min=1)
 
         with torch.no_grad():

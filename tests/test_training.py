@@ -40,7 +40,7 @@ from hand_pose_ros.training.losses import joint_loss
 from hand_pose_ros.training.objectives import objective_for
 from hand_pose_ros.training.optimizers import learning_rate, make_optimizer, orthogonal
 from hand_pose_ros.training.recipes import RECIPES, get_recipe, recipe_from_dict, recipe_to_dict
-from hand_pose_ros.training.state import save_tensors
+from hand_pose_ros.training.state import load_progress, save_tensors
 from hand_pose_ros.training.stream import SampleStream
 from hand_pose_ros.training.validation import some_samples
 
@@ -555,7 +555,7 @@ def test_a_killed_run_continues_bit_for_bit(folder, tmp_path):
     time.sleep(0.5)
     process.kill()
     process.wait()
-    stopped_at = int(run_state(state)['step'])
+    stopped_at = int(load_progress(state)['step'])
     assert 0 < stopped_at < 10_000
     again = Run(tmp_path, get_recipe('paper', [*TINY, f'root={folder}', *long]), Machine(folder / 'cache', workers=0))
     whole = tiny(folder, *long, out=tmp_path / 'whole')
@@ -676,7 +676,7 @@ def test_a_validation_that_fails_costs_no_training_and_is_made_up_for(folder, tm
     run._save_checkpoint = full
     with pytest.raises(HandPoseError, match='disk is full'):
         run.train()
-    assert run_state(run.folder.state)['step'] == 10
+    assert load_progress(run.folder.state)['step'] == 10
     tiny(folder, out=tmp_path / 'failed').train(resume=True)
     assert same_state(tmp_path / 'whole', tmp_path / 'failed')
     assert validations(tmp_path / 'failed') == validations(tmp_path / 'whole')
@@ -731,12 +731,6 @@ def test_validation_data_that_cannot_be_used_are_told_before_the_training(tmp_pa
         run()
     record_hand(tmp_path / 'val')
     run()
-
-
-def run_state(path: Path) -> dict:
-    from safetensors import safe_open
-    with safe_open(path, 'pt') as file:
-        return json.loads(file.metadata()['json'])
 
 
 def stop_after(run: Run, step: int) -> None:

@@ -1,4 +1,4 @@
-"""The pose prior: principal components of poses, and the head of a network that holds them (paper, 3.2)."""
+"""The pose prior: the principal components of poses, and the heads of networks that start from them (paper, 3.2)."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from hand_pose_ros.errors import HandPoseError
 
 @dataclass(frozen=True)
 class PosePrior:
-    """A linear model of poses in cube units (x, y, z by joint): pose = coefficients @ components + mean."""
+    """A linear model of poses: pose = coefficients @ components + mean. A pose has x, y, z by joint, in cube units."""
 
     mean: NDArray[np.float64]
     """(3J,)"""
     components: NDArray[np.float64]
-    """(k, 3J), orthonormal rows, the largest variance first."""
+    """(k, 3J), orthonormal rows. The one with the largest variance is first."""
     explained_variance_ratio: NDArray[np.float64]
-    """(k,), the share of the total variance along each component."""
+    """(k,), the share of each component in the total variance."""
 
     def project(self, poses: ArrayLike) -> NDArray[np.float64]:
         """Poses (..., 3J) -> coefficients (..., k)."""
@@ -35,40 +35,47 @@ class PosePrior:
 
 
 def fit_prior(poses: ArrayLike, components: int = 30) -> PosePrior:
-    """Principal component analysis: centred, not whitened.
+    """Principal component analysis of poses. They are centred, but not whitened.
 
     Args:
         poses: (N, 3J) or (N, J, 3), in cube units.
-        components: how many to keep; the paper finds 30 best.
+        components: number of components to keep. The paper finds 30 best.
 
     Raises:
-        HandPoseError: fewer poses or coordinates than components, or a pose that is not finite.
+        HandPoseError: there are fewer poses or coordinates than components, or a pose is not finite.
     """
     poses = np.asarray(poses, np.float64)
     poses = poses.reshape(len(poses), -1)
     if min(poses.shape) < components:
         raise HandPoseError(f'{components} components need at least as many poses and coordinates, '
                             f'but there are {poses.shape[0]} poses of {poses.shape[1]} coordinates: choose fewer '
-                            '(--set options.bottleneck=N), or give more poses')
+                            'components (--set options.bottleneck=N), or give more poses')
     if not np.isfinite(poses).all():
         raise HandPoseError('the poses for the prior hold values that are not finite')
     mean = poses.mean(0)
-    # The covariance is 3J x 3J however many poses there are: a million cost no more memory than their own.
+    # The covariance is 3J x 3J, however many poses there are.
     centred = poses - mean
     variance, vectors = np.linalg.eigh(centred.T @ centred)
     variance, vectors = variance[::-1].clip(min=0), vectors[:, ::-1].T
     kept = vectors[:components]
-    # An eigenvector has no sign of its own: make its largest entry positive, so that two machines agree.
+    # An eigenvector has no sign of its own. Its largest entry is made positive, so that all machines agree.
     kept = kept * np.sign(kept[np.arange(components), np.abs(kept).argmax(1)])[:, None]
     return PosePrior(mean, kept, variance[:components] / max(variance.sum(), np.finfo(float).tiny))
 
 
 class PoseHead(nn.Module):
-    """Fully connected layers from features to joints, directly or through the prior.
+    """Fully connected layers from features to joints.
 
-    features -> [hidden, ReLU, dropout] ... -> joints, or -> `bottleneck` coefficients -> reconstruction.
-    The reconstruction is an ordinary linear layer that starts from the principal components (`set_prior`)
-    and is trained on.
+    Without a bottleneck, the last layer gives the joints. With one, it gives `bottleneck` coefficients, and the
+    reconstruction turns them into joints. The reconstruction is an ordinary linear layer. It starts from the principal
+    components (`set_prior`) and is trained like the other layers.
+
+    Args:
+        features: number of inputs.
+        joints: number of joints, J.
+        bottleneck: number of coefficients of the pose prior; None = no prior.
+        hidden: widths of the hidden layers. Each is followed by ReLU and dropout.
+        dropout: share of hidden units that are dropped while training.
     """
 
     def __init__(self, features: int, joints: int, bottleneck: int | None, hidden: Sequence[int],
@@ -84,7 +91,7 @@ class PoseHead(nn.Module):
         self.reconstruction = plain_linear(bottleneck, 3 * joints) if bottleneck else None
 
     def set_prior(self, mean: ArrayLike, components: ArrayLike) -> None:
-        """Start the reconstruction from mean (3J,) and components (k, 3J), k = the bottleneck."""
+        """Start the reconstruction from a mean (3J,) and components (bottleneck, 3J)."""
         _set_reconstruction(self.reconstruction, mean, components)
 
     def forward(self, features: Tensor) -> Tensor:  # (B, F) -> (B, J, 3)
@@ -95,10 +102,11 @@ class PoseHead(nn.Module):
 
 
 class PriorOverVotes(nn.Module):
-    """Joints that were found one by one are made one hand: what is not seen follows from what is.
+    """Turns joints that were found one by one into one hand. Joints that are not seen follow from those that are.
 
-    They are projected onto the principal components; a hidden layer, which sees them all and how sure each is, moves
-    the coefficients; the reconstruction gives joints again. All of it starts from the prior and is trained on.
+    The joints are projected onto the principal components. A hidden layer sees all joints and how sure each is, and
+    moves the coefficients. The reconstruction turns them into joints again. At first this is the projection onto the
+    prior, and then all layers are trained.
     """
 
     HIDDEN = 256
@@ -113,7 +121,7 @@ class PriorOverVotes(nn.Module):
         self.reconstruction = plain_linear(bottleneck, 3 * joints)
 
     def set_prior(self, mean: ArrayLike, components: ArrayLike) -> None:
-        """Start projection and reconstruction from mean (3J,) and components (k, 3J), k = the bottleneck."""
+        """Start projection and reconstruction from a mean (3J,) and components (bottleneck, 3J)."""
         _set_reconstruction(self.reconstruction, mean, components)
         with torch.no_grad():
             self.projection.weight.copy_(self.reconstruction.weight.T)
@@ -141,7 +149,7 @@ def _set_reconstruction(layer: nn.Linear | None, mean: ArrayLike, components: Ar
 
 
 def relu_linear(inputs: int, outputs: int) -> nn.Linear:
-    """A fully connected layer before a ReLU: N(0, 0.01), zero bias (original code)."""
+    """A fully connected layer before a ReLU. Weights from N(0, 0.01), zero bias (original code)."""
     layer = nn.Linear(inputs, outputs)
     nn.init.normal_(layer.weight, std=0.01)
     nn.init.zeros_(layer.bias)
@@ -149,7 +157,7 @@ def relu_linear(inputs: int, outputs: int) -> nn.Linear:
 
 
 def plain_linear(inputs: int, outputs: int) -> nn.Linear:
-    """A fully connected layer without a ReLU: uniform (Glorot and Bengio 2010), zero bias (original code)."""
+    """A fully connected layer without a ReLU. Uniform weights (Glorot and Bengio 2010), zero bias (original code)."""
     layer = nn.Linear(inputs, outputs)
     nn.init.xavier_uniform_(layer.weight)
     nn.init.zeros_(layer.bias)

@@ -1,10 +1,10 @@
-"""Refinement of joints (paper, section 3.3): a small network per joint looks at the surroundings of its estimate.
+"""Refinement of joints: a small network per joint looks at the surroundings of its estimate (paper, section 3.3).
 
-Each joint has weights of its own; the network predicts truth minus estimate, moves the estimate and looks again. All
-joints of all hands run as one grouped computation, so the time is that of the arithmetic and not of the calls.
+Each joint has its own weights. Its network predicts the truth minus the estimate, moves the estimate, and looks again.
+All joints of all hands are one grouped computation. So the arithmetic decides the time, and not the number of calls.
 
-Only the idea is published. Everything in numbers (patch sizes, filters, widths, cube) is a choice of ours, made so
-that 21 joints twice take a few milliseconds on two CPU cores.
+Only the idea is published. All numbers (sizes of regions, filters, widths) are ours. With them, two iterations for 21
+joints take a few milliseconds on two CPU cores.
 """
 
 from __future__ import annotations
@@ -21,31 +21,32 @@ from hand_pose_ros.models.prior_net import relu_conv
 
 
 class Layer(NamedTuple):
-    """A convolution with its pooling (1 = none), as everywhere in the paper: valid, then max-pooled, then ReLU."""
+    """A convolution without padding, max-pooling, and ReLU, as everywhere in the paper."""
 
     filters: int
     size: int
     pool: int
+    """Side of the windows that are pooled; 1 = no pooling."""
 
 
 class Region(NamedTuple):
-    """What one branch looks at: a cube centred on the joint, and its layers."""
+    """What one branch looks at (a cube around the joint), and the layers of the branch."""
 
     width: int
-    """Of the cube, in pixels of the patch."""
+    """Side of the cube, in pixels of the patch."""
     shrink: int
-    """The region is taken from the patch pooled by this factor (the nearest reading of a square stays)."""
+    """The patch is made smaller by this factor first. Of each square of pixels, the nearest reading is kept."""
     layers: tuple[Layer, ...]
 
 
 class Refiner(nn.Module):
-    """Refines J joints with J small networks of one architecture.
+    """Refines J joints with J small networks of the same architecture.
 
     Args:
-        joints: J.
-        regions: one for every branch.
-        hidden: widths of the fully connected layers behind the branches.
-        dropout: after each of them, while training.
+        joints: number of joints, J.
+        regions: one for each branch.
+        hidden: widths of the fully connected layers after the branches.
+        dropout: share of the units of these layers that are dropped while training.
     """
 
     def __init__(self, joints: int, regions: tuple[Region, ...], hidden: tuple[int, ...],
@@ -64,14 +65,14 @@ class Refiner(nn.Module):
         *inner, last = self.weights
         for weight in inner:
             nn.init.normal_(weight, std=(2 / weight.shape[1]) ** 0.5)
-        nn.init.normal_(last, std=0.001)  # so that an untrained refiner moves nothing
+        nn.init.normal_(last, std=0.001)  # an untrained refiner hardly moves a joint
         self.dropout = nn.Dropout(dropout)
         self.cut = cut  # an engine may have a faster one
 
     def forward(self, patch: Tensor, joints: Tensor, iterations: int = 2) -> Tensor:
         """Patch (B, 1, 128, 128) and estimates (B, J, 3) in cube units -> better estimates (B, J, 3).
 
-        The gradient reaches the weights through the last iteration only: where to look is taken as given.
+        There is no gradient for where to look. So the weights get theirs from the last iteration only.
         """
         marked = torch.where(patch < 1, patch, torch.full_like(patch, FAR))
         images = [_framed(marked, region) for region in self.regions]
@@ -82,7 +83,7 @@ class Refiner(nn.Module):
         return joints
 
     def offsets(self, windows: list[Tensor]) -> Tensor:
-        """For every region (B, J, N, N), centred on the estimates -> truth minus estimate (B, J, 3) in cube units."""
+        """Windows (B, J, N, N) around the estimates, one per region -> truth minus estimate (B, J, 3) in cube units."""
         features = [branch(window).unflatten(1, (self.joints, -1)).flatten(2)
                     for branch, window in zip(self.branches, windows, strict=True)]
         x = torch.cat(features, dim=2).transpose(0, 1)  # (J, B, F): one matrix product per joint
@@ -94,7 +95,7 @@ class Refiner(nn.Module):
         return x.transpose(0, 1) * max(map(_reach, self.regions))
 
     def for_joint(self, joint: int) -> Refiner:
-        """The network of one joint alone, a copy: what the grouped computation is compared with."""
+        """A copy of the network of one joint. The grouped computation is compared with it."""
         alone = Refiner(1, self.regions, tuple(bias.shape[2] for bias in self.biases)[:-1], self.dropout.p)
         state = {name: tensor.view(self.joints, -1)[joint] for name, tensor in self.state_dict().items()}
         alone.load_state_dict({name: state[name].view_as(tensor) for name, tensor in alone.state_dict().items()})
@@ -102,7 +103,7 @@ class Refiner(nn.Module):
 
 
 class StdRef(Refiner):
-    """The convolutions of the Deep network on one region per joint, 64 pixels (half the cube) wide."""
+    """One region per joint, 64 pixels (half the patch) wide, with the convolutions of the Deep network."""
 
     def __init__(self, joints: int = 21, hidden: tuple[int, ...] = (96, 96), dropout: float = 0.3) -> None:
         region = Region(64, 1, (Layer(8, 5, 2), Layer(8, 5, 2), Layer(8, 3, 1)))
@@ -110,9 +111,9 @@ class StdRef(Refiner):
 
 
 class ORRef(Refiner):
-    """Overlapping regions: three per joint; the smallest is not pooled, the larger the more.
+    """Three overlapping regions per joint. The larger a region is, the more it is pooled.
 
-    So the network sees finely where the joint is, and coarsely what is around it.
+    So the network sees the joint finely, and its surroundings coarsely.
     """
 
     def __init__(self, joints: int = 21, hidden: tuple[int, ...] = (96, 96), dropout: float = 0.3) -> None:
@@ -136,16 +137,16 @@ def _branch(joints: int, layers: tuple[Layer, ...]) -> list[nn.Module]:
 
 
 FAR = 100.0
-"""Stands for the background, so that it stays behind the back face whatever depth a window is centred on."""
+"""Depth of the background in cube units. It is behind the back face of every cube, wherever a joint is."""
 
 
 def _reach(region: Region) -> float:
-    """From the centre of a region to its faces, in cube units."""
+    """Distance from the centre of a region to its faces, in cube units."""
     return region.width / PATCH_SIZE
 
 
 def _framed(marked: Tensor, region: Region) -> Tensor:
-    """(B, 1, 128, 128) -> (B, W, W): pooled for a region, with background around it."""
+    """Patches (B, 1, 128, 128) -> images (B, W, W), made smaller for a region, with a border of background."""
     if region.shrink > 1:
         marked = -F.max_pool2d(-marked, region.shrink)
     border = region.width // region.shrink
@@ -153,15 +154,18 @@ def _framed(marked: Tensor, region: Region) -> Tensor:
 
 
 def cut(image: Tensor, joints: Tensor, region: Region) -> Tensor:
-    """The cubes of a region around the joints (B, J, 3), as (B, J, N, N) in [-1, 1] like a patch.
+    """Windows (B, J, N, N) around the joints (B, J, 3), in [-1, 1] like a patch.
 
-    Depth is taken relative to the joint and clipped to the cube, and then shifted by the fraction of a pixel
-    (bilinear), so that the regions, and with them the result, follow the estimate without jumps.
+    Depth is relative to the joint, and clipped to the cube of the region. The window is shifted by fractions of a pixel
+    (bilinear). So the window, and the result, follow the estimate without jumps.
+
+    Args:
+        image: (B, W, W), see `_framed`.
     """
     size, cells, reach = PATCH_SIZE // region.shrink, region.width // region.shrink, _reach(region)
     stride = size + 2 * cells + 1
-    joints = joints.float()  # a half has not the precision for positions
-    # An estimate further out than the clamp sees nothing but background, wherever it is.
+    joints = joints.float()  # half precision is too coarse for positions
+    # Further out than the clamp, a window holds nothing but background.
     corner = (joints[..., :2].clamp(-1 - reach, 1 + reach) + 1) * (size / 2) + cells / 2
     whole = corner.floor()
     x, y = (corner - whole).to(image.dtype)[..., None, None, :].unbind(-1)  # (B, J, 1, 1) each

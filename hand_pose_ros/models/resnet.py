@@ -1,4 +1,4 @@
-"""DeepPrior++ (Oberweger and Lepetit 2017): a pre-activation bottleneck residual network with the prior."""
+"""DeepPrior++ (Oberweger and Lepetit 2017): a residual network with pre-activation, and the pose prior."""
 
 from __future__ import annotations
 
@@ -8,10 +8,17 @@ from hand_pose_ros.models.prior_net import PoseNetwork, relu_conv
 
 
 class ResNet(PoseNetwork):
-    """Stem, four stages of `blocks` blocks, and the head of Deep-Prior (original code).
+    """A stem, four stages of residual blocks, and the head of Deep-Prior (original code).
 
-    `last_stride` 1 is the network that the authors' code builds (its last stage asks for stride 2, which an
-    identity ignores): 18.7 M parameters at 14 joints. 2 is the network that was meant: 6.2 M, and faster.
+    Args:
+        joints: number of joints, J.
+        bottleneck: number of coefficients of the pose prior; None = no prior.
+        dropout: share of hidden units of the head that are dropped while training.
+        channels: of the stem and the stages.
+        blocks: number of blocks in each stage.
+        last_stride: stride of the last stage. 1 is the network that the authors' code builds (18.7 M parameters with 14
+            joints), because it asks an identity for a stride of 2, which has none. 2 is the network that was meant
+            (6.2 M parameters, and faster).
     """
 
     def __init__(self, joints: int = 21, bottleneck: int | None = 30, dropout: float = 0.3,
@@ -20,7 +27,7 @@ class ResNet(PoseNetwork):
         stem, *stages = channels
         layers: list[nn.Module] = [relu_conv(1, stem, 5, padding=2), nn.MaxPool2d(2)]
         for inputs, outputs in zip(channels, stages, strict=False):
-            # Without a change of channels the original keeps the identity, and with it the resolution.
+            # Where the number of channels stays, the original keeps the identity, and so the resolution.
             stride = 2 if inputs != outputs else last_stride
             layers.append(_Block(inputs, outputs, stride))
             layers += [_Block(outputs, outputs, 1) for _ in range(blocks - 1)]
@@ -29,7 +36,10 @@ class ResNet(PoseNetwork):
 
 
 class _Block(nn.Module):
-    """norm-ReLU-1x1-norm-ReLU-3x3-norm-ReLU-1x1 plus the identity, or a 1x1 projection of the first ReLU."""
+    """A bottleneck block (norm, ReLU, 1x1, norm, ReLU, 3x3, norm, ReLU, 1x1) plus a shortcut.
+
+    The shortcut is the identity, or a 1x1 projection of what the first ReLU gives where the shape changes.
+    """
 
     def __init__(self, inputs: int, outputs: int, stride: int) -> None:
         super().__init__()

@@ -1,8 +1,9 @@
-"""Two looks at a hand, the second from where it is seen best; a design of ours.
+"""Two looks at a hand. The second one sees it upright, in the middle, and always equally large. The design is ours.
 
-A hand may be turned any way in the image, and a network that sees it once spends most of what it can on that. Once it
-has told about where the joints are, the patch can be turned, moved and scaled so that every hand stands upright in the
-middle, as large as all others. The second network is trained for such hands, and its pose prior is one of poses alone.
+A hand may be turned any way in the image. A network that sees it once needs most of its capacity for that. Here a first
+network finds roughly where the joints are. Then the patch is turned, moved and scaled, so that all hands stand upright
+in the middle and are equally large. A second network is trained for such hands. Its pose prior needs no components for
+turns.
 """
 
 from __future__ import annotations
@@ -20,17 +21,17 @@ from hand_pose_ros.geometry import PATCH_SIZE
 from hand_pose_ros.models.dense import HandDense
 
 ZOOM = 0.95
-"""Half the width of a view, in cube units, of a hand that has the usual size: two hands in a hundred then have a
-joint that is further out than 0.86."""
+"""Half the width of the view of a hand of the usual size, in cube units. With it, 2 % of hands have a joint that is
+further out than 0.86 in the view."""
 MAX_SIZE = 0.4
-"""What the first look tells of the size (a logarithm) counts up to this."""
+"""The size that the first look gives (a logarithm) is clamped to plus or minus this."""
 STEPS = 64
-"""Middle, direction and scale of a view are rounded to one of so many steps to 1. Engines differ in the last bits of
-what the first look says; rounded, they hardly ever see another pixel for it."""
+"""The middle, direction and size of a view are rounded to multiples of 1 / STEPS. Engines differ in the last bits of
+the first look. After rounding, they nearly always see the same pixels."""
 
 
 class View(NamedTuple):
-    """Where to look from: a point p in cube units is seen at turn @ (p - middle) / scale; its depth is not turned."""
+    """Where to look from. A point p in cube units is seen at turn @ (p - middle) / scale. Depth is not turned."""
 
     middle: Tensor
     """(B, 3)"""
@@ -40,7 +41,7 @@ class View(NamedTuple):
     """(B,)"""
 
     def into(self, points: Tensor) -> Tensor:
-        """Points (B, N, 3) in cube units -> as they are seen."""
+        """Points (B, N, 3) in cube units -> the same points in units of the view."""
         offset = (points - self.middle[:, None]) / self.scale[:, None, None]
         return torch.cat([_turned(offset[..., :2], self.turn), offset[..., 2:]], dim=2)
 
@@ -50,15 +51,15 @@ class View(NamedTuple):
         return turned * self.scale[:, None, None] + self.middle[:, None]
 
     def patch(self, patch: Tensor) -> Tensor:
-        """Patch (B, 1, 128, 128) -> what is seen of it; nearest neighbour, as when an image is cropped."""
+        """Patches (B, 1, 128, 128) -> patches as they are seen. Nearest neighbour, as when an image is cropped."""
         size = PATCH_SIZE
         line = torch.arange(size, device=patch.device, dtype=torch.float32) + (0.5 - size / 2)
         middle = self.middle.float()
-        # In pixels of the patch. The steps are such that these sums are exact: no order of adding moves a pixel.
+        # In pixels of the patch. The steps are rounded so that these sums are exact, in whatever order they are added.
         steps = ((self.turn * self.scale[:, None, None]).float() * 1024).round() / 1024
         start = (middle[:, :2] + 1) * (size / 2)
         across, down, start = (part[..., None, None] for part in (steps[:, 0], steps[:, 1], start))
-        # What lies outside is read from a border of background.
+        # Places outside are read from a border of background.
         at = (line * across + line[:, None] * down + start).floor().clamp(-1, size).int() + 1
         column, row = at.unbind(1)  # (B, 128, 128) each
         image = F.pad(patch, (1, 1, 1, 1), value=1.0).flatten()
@@ -69,16 +70,17 @@ class View(NamedTuple):
 
 
 class TwoLooks(nn.Module):
-    """A `HandDense` that was trained, which stays as it is, and another one that looks where the first sees a hand.
+    """A trained `HandDense` that is not trained any more, and a second one that looks where the first sees a hand.
 
     Args:
-        joints: J.
-        root, knuckles: a hand is upright when the mean of its knuckles is above its root; these are joints.
-        width, bottleneck, blocks, refined: of the second look, see `HandDense`.
-        first: the same of the first, where they differ. It may be much smaller: it tells where to look, and no more.
+        joints: number of joints, J.
+        root, knuckles: numbers of joints. A hand is upright when the mean of its knuckles is above its root.
+        width, bottleneck, blocks, refined: options of the second look, see `HandDense`.
+        first: the same options of the first look. Those that are left out have their defaults; None = all are those of
+            the second look. The first look may be much smaller, because it only finds where to look.
 
     Raises:
-        HandPoseError: there are no such joints.
+        HandPoseError: root or knuckles are not among the joints, or a `HandDense` does not take these options.
     """
 
     outputs = HandDense.outputs
@@ -96,7 +98,7 @@ class TwoLooks(nn.Module):
         self.second = HandDense(joints, **second)
 
     def set_prior(self, mean: ArrayLike, components: ArrayLike) -> None:
-        """Start the prior of the second look from poses as it sees them: see `HandDense.set_prior`."""
+        """Start the prior of the second look from poses as this look sees them: see `HandDense.set_prior`."""
         self.second.set_prior(mean, components)
 
     @property
@@ -105,23 +107,28 @@ class TwoLooks(nn.Module):
         return self.second.head
 
     def train(self, mode: bool = True) -> TwoLooks:
-        """For the second look alone: the first does not train."""
+        """Set the mode of the second look. The first one stays in eval mode."""
         super().train(mode)
         self.first.eval()
         return self
 
     def view(self, patch: Tensor) -> View:
-        """Where to look from at the hand in a patch (B, 1, 128, 128); no gradient comes back from there."""
+        """The view of the second look at patches (B, 1, 128, 128). No gradient passes through it."""
         with torch.no_grad():
             first = self.first.forward_full(patch)
             return self.upright(first['joints'], first['size'])
 
     def upright(self, joints: Tensor, size: Tensor) -> View:
-        """Where to look from at joints (B, J, 3) of a hand of this size (B,), the logarithm over the usual one."""
+        """The view in which hands are upright, in the middle and equally large.
+
+        Args:
+            joints: (B, J, 3) in cube units.
+            size: (B,), the output `size` of `HandDense.forward_full`.
+        """
         joints, size = joints.float(), size.float()
-        # No constant and no index comes from a list, here or above: a CUDA graph cannot hold a copy from the host.
+        # Neither here nor above is a tensor made from a list: a CUDA graph cannot hold a copy from the host.
         up = torch.stack([joints[:, k, :2] for k in self.knuckles]).mean(dim=0) - joints[:, self.root, :2]
-        # Of a hand that points along the ray any direction will do, but one must.
+        # A hand that points at the camera has no direction. It gets one, so that nothing is divided by zero.
         up = up - 1e-6 * torch.arange(2, device=up.device)
         up = _unit(_rounded(_unit(up)))
         sin, cos = (-up).unbind(1)
@@ -133,7 +140,7 @@ class TwoLooks(nn.Module):
         return self.forward_full(patch)['joints']
 
     def forward_full(self, patch: Tensor) -> dict[str, Tensor]:
-        """(B, 1, 128, 128) in [-1, 1] -> joints, confidence, hand, side and size: see `HandDense.forward_full`."""
+        """(B, 1, 128, 128) in [-1, 1] -> joints, confidence, hand, side and size, as in `HandDense.forward_full`."""
         view = self.view(patch)
         seen = self.second.forward_full(view.patch(patch))
         return {**{name: seen[name] for name in self.outputs},
@@ -141,7 +148,7 @@ class TwoLooks(nn.Module):
 
 
 def _turned(points: Tensor, turn: Tensor) -> Tensor:
-    """Points (B, N, 2) after a turn (B, 2, 2); no matrix product, which training in half precision would round."""
+    """Points (B, N, 2) after a turn (B, 2, 2). Not a matrix product, which training in half precision would round."""
     return (points[:, :, None] * turn[:, None]).sum(dim=3)
 
 

@@ -1,4 +1,4 @@
-"""The estimator over every depth image of a bag, in order and as fast as it goes; over many bags, on all cores."""
+"""Runs the estimator on all depth images of a bag, or of many bags on all cores."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ _T = TypeVar('_T')
 _R = TypeVar('_R')
 Outcome = Result | HandPoseError
 AHEAD = 2
-"""So many images are decoded before their turn."""
+"""Number of images that are decoded before their turn."""
 GRACE_S = 10.0
-"""For a process to remove what it has begun, when the one that started it was killed."""
+"""Seconds for a process to remove unfinished files, after the process that started it was killed."""
 
 
 class Sink(Protocol):
-    """Is told the hands of each image."""
+    """Receives the hands of each image."""
 
     def add(self, image: Frame, hands: Sequence[HandEstimate]) -> None: ...
 
@@ -57,9 +57,9 @@ class Settings:
 
     Attributes:
         model, device: as in HandPoseEstimator.from_pretrained.
-        num_threads: of the network on the CPU; None chooses.
-        estimator: further arguments of HandPoseEstimator.
-        bag: arguments of DepthBag beside the path.
+        num_threads: maximum number of threads of the network on the CPU; None = `runtime.default_threads()`.
+        estimator: other arguments of HandPoseEstimator.
+        bag: arguments of DepthBag, except the path.
         ground_truth: a file or a topic, see `ground_truth.read_truth`.
     """
 
@@ -73,20 +73,23 @@ class Settings:
 
 def evaluate_bag(path: str | Path, settings: Settings, progress: Progress = silent,
                  open_sink: OpenSink | None = None) -> Result:
-    """Estimate every depth image of a bag; on the CPU twice the same to the last bit.
+    """Estimate all depth images of a bag. On the CPU, the result is always the same to the last bit.
 
-    While one image is estimated the next ones are read and decoded: more go through a second than `total` tells.
-    Of several hands in an image the first one counts, which is the one that has been tracked longest. An image that
-    cannot be decoded counts as one without a hand. Where the bag is damaged, what was before it is evaluated. The
-    notes of the result tell both.
+    - While an image is estimated, the next ones are read and decoded. So there are more images per second than the
+      stage `total` suggests.
+    - If there are several hands in an image, the first one counts. It is the one that has been tracked longest.
+    - An image that cannot be decoded counts as an image without a hand.
+    - If the bag is damaged, the images before the damage are evaluated.
+
+    The notes of the result report the last two.
 
     Args:
-        progress: wraps the frames.
-        open_sink: opens what is told the hands of each image, given the skeleton and the metadata of the estimator.
+        progress: wraps the images.
+        open_sink: opens the sink that receives the hands, from the skeleton and the metadata of the estimator.
 
     Raises:
-        InputError: the bag, the truth or the camera cannot be used, or there is not one image to decode.
-        CheckpointError: there are no such weights.
+        InputError: the bag, the truth or the camera cannot be used, or no image can be decoded.
+        CheckpointError: the weights do not exist or cannot be used.
     """
     estimator = HandPoseEstimator.from_pretrained(
         settings.model, device=settings.device, num_threads=settings.num_threads, **settings.estimator)
@@ -123,18 +126,18 @@ def evaluate_bag(path: str | Path, settings: Settings, progress: Progress = sile
 def evaluate_bags(paths: Sequence[str | Path], settings: Settings, jobs: int | None = None,
                   progress: Progress = silent,
                   open_sinks: Mapping[str | Path, OpenSink] | None = None) -> Iterator[tuple[str | Path, Outcome]]:
-    """Evaluate many bags at once; one that fails does not stop the others.
+    """Evaluate many bags at once. A bag that fails does not stop the others.
 
-    Where torchrun has started several processes, on one or more machines, each takes its share of the bags, and the
-    first gets all results in the end; the others get none. Each works on a GPU of its own, as far as there are enough.
+    If torchrun started several processes, on one or more machines, each evaluates its share of the bags, on a GPU of
+    its own as far as there are enough. In the end, the first process yields all results, and the others yield none.
 
     Args:
-        jobs: bags at the same time on this machine; None takes one per core.
+        jobs: number of bags at the same time on this machine; None = one per core.
         progress: wraps the finished bags.
-        open_sinks: for each bag, see `evaluate_bag`; sent to other processes.
+        open_sinks: `open_sink` of `evaluate_bag` for each bag. They are sent to other processes.
 
     Yields:
-        Each path with its result, or with what went wrong, as soon as it is done.
+        Each path with its result or its error, as soon as it is done.
     """
     world, rank = int(os.environ.get('WORLD_SIZE', 1)), int(os.environ.get('RANK', 0))
     here = int(os.environ.get('LOCAL_WORLD_SIZE', 1))
@@ -147,7 +150,7 @@ def evaluate_bags(paths: Sequence[str | Path], settings: Settings, jobs: int | N
 
 
 def read_depths(path: str | Path, rows: Sequence[int], settings: Settings) -> dict[int, NDArray[np.float32]]:
-    """The depth images (H, W) in metres of some rows of a result, as far as they can be decoded."""
+    """The depth images (H, W) in metres of some rows of a result. Images that cannot be decoded are left out."""
     depths = {}
     with DepthBag(path, **settings.bag) as bag:
         for row, frame in enumerate(islice(bag, max(rows, default=-1) + 1)):
@@ -158,10 +161,10 @@ def read_depths(path: str | Path, rows: Sequence[int], settings: Settings) -> di
 
 
 class _Image:
-    """A frame, decoded as far as it can be."""
+    """A frame with its decoded depth and intrinsics, or the error if it cannot be decoded."""
 
     def __init__(self, frame: Frame, read: float) -> None:
-        """`read`: the seconds that it took to be read."""
+        """`read` is the time that reading the frame took, in seconds."""
         self.frame = frame
         self.error: InputError | None = None
         start = time.perf_counter()
@@ -173,7 +176,7 @@ class _Image:
 
 
 class _Record:
-    """What came out of each image, in order."""
+    """The joints and times of all images, in order."""
 
     def __init__(self, estimator: HandPoseEstimator) -> None:
         self._estimator = estimator
@@ -186,7 +189,7 @@ class _Record:
         self.frame_id = ''
 
     def add(self, image: _Image) -> list[HandEstimate]:
-        """Estimate the hands of an image, and keep them and the time it took."""
+        """Estimate the hands of an image. Their joints and the times of the stages are kept."""
         hands: list[HandEstimate] = []
         times: dict[str, float] = {}
         try:
@@ -199,7 +202,7 @@ class _Record:
             self.intrinsics = self.intrinsics or image.intrinsics
         except InputError as error:
             self.failures.append(f'image {len(self.stamps) + 1}: {error}')
-        for stage in {**self.seconds, **times}:  # in the order of the path
+        for stage in {**self.seconds, **times}:  # in the order in which they run
             self.seconds.setdefault(stage, [np.nan] * len(self.stamps)).append(times.get(stage, np.nan))
         self.stamps.append(image.frame.stamp_ns)
         self.frame_id = image.frame.frame_id
@@ -210,7 +213,7 @@ class _Record:
 
 
 def _in_background(work: Callable[[_T], _R], items: Iterable[_T]) -> Generator[tuple[_T, _R]]:
-    """Each item and what becomes of it, in order; the work is done in a thread while the next items are made."""
+    """Each item with the result of the work on it, in order. A thread does the work while the next items are made."""
     with ThreadPoolExecutor(1) as worker:
         pending: deque[tuple[_T, Future[_R]]] = deque()
         for item in items:
@@ -223,9 +226,12 @@ def _in_background(work: Callable[[_T], _R], items: Iterable[_T]) -> Generator[t
 
 
 def until_damaged(frames: Iterable[Frame], notes: list[str]) -> Iterator[tuple[Frame, float]]:
-    """The frames and how many seconds each took to be read.
+    """The frames, each with the time in seconds that reading it took.
 
-    They end where the bag is damaged, with a note of it; before the first frame that is an error.
+    They end where the bag is damaged, and a note is added.
+
+    Raises:
+        InputError: the bag is damaged before its first frame.
     """
     frame = None
     start = time.perf_counter()
@@ -241,8 +247,8 @@ def until_damaged(frames: Iterable[Frame], notes: list[str]) -> Iterator[tuple[F
 
 def _attempts(paths: Sequence[str | Path], settings: Settings, sinks: Mapping[str | Path, OpenSink],
               workers: int) -> Iterator[tuple[str | Path, Outcome]]:
-    """Each bag as it is done, and what came of it."""
-    if workers == 1:  # need not be another process, which would load everything again
+    """Each bag with its result or its error, as soon as it is done."""
+    if workers == 1:  # in this process, because another one would have to load everything again
         for path in paths:
             yield path, _attempt(path, settings, sinks.get(path))
         return
@@ -253,22 +259,22 @@ def _attempts(paths: Sequence[str | Path], settings: Settings, sinks: Mapping[st
             path = futures[future]
             try:
                 yield path, future.result()
-            except Exception as error:  # the process itself died: out of memory, say
+            except Exception as error:  # the process itself died, for example without memory
                 yield path, _unexpected(path, error)
-    except BaseException:  # SIGTERM, which need not reach the others as Ctrl-C does
+    except BaseException:  # for example SIGTERM, which does not always reach the other processes, as Ctrl-C does
         for worker in multiprocessing.active_children():
             worker.terminate()
         raise
     finally:
-        pool.shutdown(cancel_futures=True)  # after Ctrl-C no further bag begins
+        pool.shutdown(cancel_futures=True)  # after Ctrl-C, no other bag is begun
 
 
 def _start_worker() -> None:
     def stop(*_: object) -> None:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the next must not interrupt what this one begins
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second signal must not interrupt the clean-up
         sys.exit(1)  # unlike a KeyboardInterrupt, it leaves no traceback
 
-    signal.signal(signal.SIGTERM, stop)  # by default it would leave half-written bags
+    signal.signal(signal.SIGTERM, stop)  # by default, it would leave half-written bags
     leave_with_parent(GRACE_S)
 
 
@@ -277,7 +283,7 @@ def _attempt(path: str | Path, settings: Settings, open_sink: OpenSink | None) -
         return evaluate_bag(path, replace(settings, device=_own_gpu(settings.device)), open_sink=open_sink)
     except HandPoseError as error:
         return error
-    except Exception as error:  # a defect of ours must not lose the results of the other bags
+    except Exception as error:  # a bug must not lose the results of the other bags
         return _unexpected(path, error)
 
 
@@ -299,10 +305,10 @@ def _unexpected(path: str | Path, error: Exception) -> HandPoseError:
 
 
 def _gather(done: dict[str | Path, Outcome], rank: int, world: int) -> dict[str | Path, Outcome]:
-    """Everybody's results at the first process; none elsewhere."""
+    """The results of all processes, in the first process. In the others, an empty dictionary."""
     import torch.distributed as dist
 
-    dist.init_process_group('gloo', timeout=timedelta(days=7))  # the others may have longer bags
+    dist.init_process_group('gloo', timeout=timedelta(days=7))  # other processes may have longer bags
     try:
         everything: list[dict[str | Path, Any]] | None = [{}] * world if rank == 0 else None
         dist.gather_object(done, everything)

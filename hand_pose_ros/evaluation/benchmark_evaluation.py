@@ -1,4 +1,4 @@
-"""Weights on synthetic-test-v1: the networks alone, on the crops of the benchmark, and how far they know themselves."""
+"""Evaluates weights on the crops of synthetic-test-v1: their errors, and how far their confidence can be trusted."""
 
 from __future__ import annotations
 
@@ -21,26 +21,29 @@ from hand_pose_ros.skeleton import HAND21, get_skeleton
 from hand_pose_ros.synthetic import benchmark
 
 NEAR_MM = 20.0
-"""A joint is right within this distance: what a confidence is the probability of."""
+"""A joint is right within this distance. A confidence is the probability of this."""
 BINS = np.linspace(0, 1, 11)
+"""Limits of the bins of confidence."""
 THIRDS = 3
-"""Of the joints: frames are told apart by how many are visible."""
+"""Number of groups of frames, by the number of visible joints."""
 NOMINAL = Intrinsics(475.0, 475.0, 320.0, 240.0, 640, 480)
-"""For results whose frames are of many cameras."""
+"""Intrinsics of results whose frames are from many cameras."""
 
 
 def evaluate_benchmark(model: str | None = None, device: str = 'auto', frames: int = benchmark.FRAMES,
                        progress: Progress = silent) -> Result:
-    """Joints of the frames of synthetic-test-v1 that show a hand; left hands are mirrored, so the side is given.
+    """The joints of the frames of synthetic-test-v1 that show a hand. Left hands are mirrored, so the side is given.
 
-    `info` has the errors of joints that the camera sees and of those that it does not, and the errors of frames by how
-    many of their joints it sees. For networks that judge themselves it also has the calibration of the confidence of
-    joints, how often the side is found (from both mirrorings of each patch), and the share of frames with and without a
-    hand that the score lets pass.
+    `info` has the errors of joints that the camera sees, those of joints that it does not see, and the errors of frames
+    by how many of their joints it sees. For networks with a confidence, it also has:
+
+    - the calibration of the confidence of joints
+    - the share of hands whose side is found, from each patch and its mirror image
+    - the share of frames with a hand, and of frames without one, that the estimator would report
 
     Args:
-        model: name of weights that ship, or path of a checkpoint; None takes the default.
-        frames: only the first so many.
+        model: name of weights that ship, or path of a checkpoint; None = the default.
+        frames: number of frames, from the first on.
 
     Raises:
         InputError: the weights are for other joints.
@@ -55,7 +58,7 @@ def evaluate_benchmark(model: str | None = None, device: str = 'auto', frames: i
     for batch in progress(benchmark.frames(frames, batch=batch_size), -(-frames // batch_size)):
         answer = engine.run_full(batch['patch'].numpy())
         present = batch['hand_present'].numpy()
-        # Truth and estimate alike are those of the mirrored scene where the hand is a left one.
+        # For a left hand, truth and estimate are those of the mirrored scene.
         cube = seen_centers(batch), batch['cube_side']
         predicted = joints_in_metres(batch['joints'].new_tensor(answer['joints']), *cube).double().numpy()
         expected = joints_in_metres(batch['joints'], *cube).double().numpy()

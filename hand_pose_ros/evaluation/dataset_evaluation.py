@@ -1,4 +1,4 @@
-"""Weights on the test frames of a recorded dataset, on crops as they were trained with."""
+"""Evaluates weights on the test frames of a recorded dataset. The crops are made as in training."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from hand_pose_ros.runtime import make_engine
 
 def evaluate_dataset(name: str, root: Path | None, model: str | None = None, split: str = 'test', device: str = 'auto',
                      progress: Progress = silent) -> Result:
-    """Joints of all frames of a split. The crops follow the protocol of the original code: they start from the label.
+    """The joints of all frames of a split. The crops start from the labels (original code).
 
     Args:
         name: of a recorded dataset, see `hand_pose_ros.datasets.open_dataset`.
-        root: its folder.
-        model: name of weights that ship, or path of a checkpoint; None takes the default.
+        root: folder of the dataset.
+        model: name of weights that ship, or path of a checkpoint; None = the default.
 
     Raises:
         InputError: the weights are for other joints.
-        DatasetError: there is no such dataset or split, or its files are missing or damaged.
+        DatasetError: the dataset or split does not exist, or its files are missing or damaged.
     """
     dataset = open_dataset(name, split, root)
     assert isinstance(dataset, RecordedDataset) and dataset.size is not None

@@ -1,4 +1,4 @@
-"""Where the hands of a bag really were: from a topic of it, an .npz file, or a text file."""
+"""The true joints of a bag, from one of its topics, an .npz file, or a text file."""
 
 from __future__ import annotations
 
@@ -15,19 +15,20 @@ from hand_pose_ros.evaluation.results import DAMAGE, Result
 from hand_pose_ros.skeleton import Skeleton
 
 TOLERANCE_NS = 10_000_000
-"""A label belongs to the image with the nearest stamp, if it is not further away than this (10 ms)."""
+"""A label belongs to the image with the nearest stamp, if the two are at most this far apart (10 ms)."""
 
 Joints = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Truth:
-    """The true joints of M frames, as their source has them.
+    """The true joints of M frames, as they are in their source.
 
     Attributes:
-        joints: (M, J, 3) metres, optical frame, or the labels of a text file, which only a camera turns into that.
-        stamps_ns: (M,); None where the frames are those of the bag, in order.
-        frame_id: of the coordinates; empty if the source does not say.
+        source: the file or topic.
+        joints: (M, J, 3) in metres, optical frame; or the labels of a text file, which need the intrinsics for that.
+        stamps_ns: (M,); None = there is one frame for each image of the bag, in order.
+        frame_id: of the coordinates; empty if the source does not name it.
     """
 
     source: str
@@ -40,12 +41,15 @@ def read_truth(source: str, bag: str | Path, skeleton: Skeleton) -> Truth:
     """The true joints of a bag.
 
     Args:
-        source: a topic of the bag with HandJointsArray, one hand a message; an .npz file with `joints` (M, J, 3) in
-            metres and, if there are fewer than images, `stamps_ns` (M,); or a text file with `u v d` per joint and a
-            line for each image, see `published`.
+        source: one of these.
+
+            - A topic of the bag, with HandJointsArray and one hand per message.
+            - An .npz file with `joints` (M, J, 3) in metres. If there are fewer labels than images, it also has
+              `stamps_ns` (M,).
+            - A text file with a line for each image, and `u v d` for each joint, see `published`.
 
     Raises:
-        InputError: there is no such source, or it does not fit the skeleton.
+        InputError: the source does not exist, cannot be read, or does not fit the skeleton.
     """
     truth = _read(source, bag, skeleton)
     if not isinstance(truth.joints, Labels):
@@ -62,7 +66,7 @@ def read_truth(source: str, bag: str | Path, skeleton: Skeleton) -> Truth:
 
 
 def with_truth(result: Result, truth: Truth, frame_id: str) -> Result:
-    """The result of N images of a bag, with the true joints; images without a label get a note.
+    """The result of a bag, with the true joints. If images have no label, a note says so.
 
     Args:
         frame_id: of the images.
@@ -77,7 +81,7 @@ def with_truth(result: Result, truth: Truth, frame_id: str) -> Result:
     elif len(joints) != len(result.predictions):
         raise InputError(f'{truth.source}: {len(joints)} labels for {len(result.predictions)} images: give one for '
                          'each image, or an .npz file with stamps_ns')
-    joints = np.where(joints[..., 2:] > 0, joints, np.nan)  # at the camera or behind it: as not labelled in text files
+    joints = np.where(joints[..., 2:] > 0, joints, np.nan)  # at or behind the camera means not labelled
     missing = int(np.isnan(joints).all((1, 2)).sum())
     notes = (f'{missing} of {len(joints)} images have no label in {truth.source} and are not scored.',) \
         if missing else ()
@@ -104,7 +108,7 @@ def _read(source: str, bag: str | Path, skeleton: Skeleton) -> Truth:
 
 
 def _read_topic(topic: str, bag: str | Path, skeleton: Skeleton) -> Truth:
-    # Of a damaged bag what was before the damage, as of its images, which say so.
+    # If the bag is damaged, the messages before the damage are read, like the images.
     messages = [message for message in read_hands(bag, topic, partly=True) if len(message.joints)]
     if not messages:
         raise InputError(f'{bag}: {topic} has no hand in any message, so there is nothing to compare with')
@@ -121,14 +125,13 @@ def _read_topic(topic: str, bag: str | Path, skeleton: Skeleton) -> Truth:
 
 
 def _match(stamps: NDArray[np.int64], joints: Joints, result: Result, source: str) -> Joints:
-    """For each image the label with the nearest stamp; NaN (J, 3) if none is near enough, or another image is nearer.
-    """
+    """The label (J, 3) with the nearest stamp, for each image. NaN if it is too far off, or another image is nearer."""
     assert result.stamps_ns is not None
     order = np.argsort(stamps, kind='stable')
     stamps, joints = stamps[order], joints[order]
     if (same := np.diff(stamps) == 0).any():
-        raise InputError(f'{source}: several labels have the stamp {stamps[1:][same][0]} ns, so whose they are is '
-                         'unknown: give an .npz file with a label for each image, and no stamps')
+        raise InputError(f'{source}: several labels have the stamp {stamps[1:][same][0]} ns, so it is unknown which '
+                         'images they belong to: give an .npz file with a label for each image, and no stamps')
     right = np.searchsorted(stamps, result.stamps_ns).clip(1, max(1, len(stamps) - 1))
     candidates = np.stack([right - 1, right.clip(max=len(stamps) - 1)])
     distances = np.abs(stamps[candidates] - result.stamps_ns)

@@ -1,11 +1,11 @@
-"""The numbers by which hand poses are judged. Pure numpy, each with its definition and source.
+"""The numbers by which hand poses are judged, with their definitions and sources. Only numpy is used.
 
-Joints are (N, J, 3) in metres: N frames, J joints. A joint that is not finite is absent: in the truth it was
-not labelled and is not scored; in the prediction it was missed. `joint_errors_mm` turns both into one table,
-NaN = not scored and inf = missed, and everything after it follows from two rules:
+Joints are (N, J, 3) in metres, for N frames and J joints. A joint that is not finite is missing. If it is missing in
+the truth, it was not labelled, and is not scored. If it is missing in the prediction, it was missed. In the table that
+`joint_errors_mm` returns, NaN = not scored and inf = missed. There are two rules for all other numbers:
 
-- averages are over the joints that were predicted (how many were not is reported beside them);
-- curves count a missed joint as a failure at every distance.
+- Averages are over the joints that were predicted. The number of missed joints is reported beside them.
+- In curves, a missed joint is a failure at every distance.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def joint_errors_mm(predictions: ArrayLike, truth: ArrayLike) -> Floats:
         predictions, truth: (N, J, 3) in metres.
 
     Returns:
-        (N, J) in millimetres; NaN where the truth has no such joint, inf where only the prediction lacks it.
+        (N, J) in millimetres; NaN = not labelled, inf = labelled but missed.
 
     Raises:
         InputError: the shapes differ.
@@ -48,7 +48,7 @@ def joint_errors_mm(predictions: ArrayLike, truth: ArrayLike) -> Floats:
 def mean_mm(errors_mm: ArrayLike) -> float:
     """Mean over all joints that were predicted and scored; NaN if there is none.
 
-    Every joint weighs the same, so with complete data this is also the mean of the frames' means.
+    All joints have the same weight. So without missing joints, this is also the mean of the means of the frames.
     """
     found = _found(errors_mm)
     return float(found.mean()) if found.size else float('nan')
@@ -67,7 +67,7 @@ def max_mm(errors_mm: ArrayLike) -> float:
 
 
 def frame_means_mm(errors_mm: ArrayLike) -> Floats:
-    """Mean of each frame (N,) over its predicted joints; NaN if none is labelled, inf if all were missed."""
+    """Mean of each frame (N,) over its predicted joints; NaN = no joint is labelled, inf = all were missed."""
     errors = np.asarray(errors_mm, np.float64)
     found = np.isfinite(errors)
     count = found.sum(-1)
@@ -77,7 +77,7 @@ def frame_means_mm(errors_mm: ArrayLike) -> Floats:
 
 
 def worst_joints_mm(errors_mm: ArrayLike) -> Floats:
-    """Error of each frame's worst joint, (N,); inf if one was missed, NaN if nothing is labelled."""
+    """Error of the worst joint of each frame, (N,); inf = a joint was missed, NaN = no joint is labelled."""
     errors = np.asarray(errors_mm, np.float64)
     labelled = ~np.isnan(errors)
     worst = np.where(labelled, errors, -np.inf).max(-1, initial=-np.inf)
@@ -86,7 +86,7 @@ def worst_joints_mm(errors_mm: ArrayLike) -> Floats:
 
 
 def success_curve(errors_mm: ArrayLike, distances_mm: ArrayLike) -> Floats:
-    """Fraction (D,) of labelled frames whose every joint is within each distance (Taylor et al. 2012)."""
+    """Fraction (D,) of labelled frames with all joints within each distance (Taylor et al. 2012)."""
     return _fraction_within(worst_joints_mm(errors_mm), distances_mm)
 
 
@@ -96,10 +96,10 @@ def pck(errors_mm: ArrayLike, distances_mm: ArrayLike) -> Floats:
 
 
 def auc(errors_mm: ArrayLike, limit_mm: float = 80) -> float:
-    """Area under `success_curve` from 0 to `limit_mm`, divided by the limit: 1 is perfect.
+    """Area under `success_curve` from 0 to `limit_mm`, divided by the limit. 1 is perfect.
 
-    The exact integral of the step curve, mean(max(0, 1 - worst / limit)). The code of DeepPrior averages the
-    curve at the whole millimetres 0, 1 .. 79 instead, which comes out 0.005 to 0.006 lower.
+    This is the exact integral of the step curve, mean(max(0, 1 - worst / limit)). The code of DeepPrior averages the
+    curve at 0, 1, ... 79 mm instead, which gives 0.005 to 0.006 less.
     """
     worst = worst_joints_mm(errors_mm)
     worst = worst[~np.isnan(worst)]
@@ -112,7 +112,7 @@ def per_joint_mm(errors_mm: ArrayLike) -> Floats:
 
 
 def per_finger_mm(errors_mm: ArrayLike, skeleton: Skeleton) -> dict[str, float]:
-    """`mean_mm` of the joints of each finger, and of the 'palm' (all joints that belong to no finger)."""
+    """`mean_mm` of the joints of each finger, and of the 'palm', which has all other joints."""
     errors, owner = np.asarray(errors_mm, np.float64), np.array(skeleton.fingers)
     return {name: mean_mm(errors[:, owner == name]) for name in (*FINGERS, 'palm')}
 
@@ -123,17 +123,17 @@ def missed_frames(errors_mm: ArrayLike) -> NDArray[np.bool_]:
 
 
 def align_translation(predictions: ArrayLike, truth: ArrayLike) -> Floats:
-    """Predictions (N, J, 3) moved so that in each frame the mean of the joints is that of the truth."""
+    """Predictions (N, J, 3), moved in each frame so that the mean of their joints is that of the truth."""
     predictions, truth = np.asarray(predictions, np.float64), np.asarray(truth, np.float64)
     weights = _common(predictions, truth)
     return predictions - _center(predictions, weights) + _center(truth, weights)
 
 
 def align_rigid(predictions: ArrayLike, truth: ArrayLike) -> Floats:
-    """Predictions (N, J, 3) rotated and moved in each frame for the least squared distance to the truth.
+    """Predictions (N, J, 3), rotated and moved in each frame so that their squared distance to the truth is least.
 
-    Rotation and translation only, neither scale nor mirror image (Kabsch 1976; the sign as in Umeyama 1991).
-    A frame with fewer than three joints in common has no such rotation and becomes NaN.
+    They are neither scaled nor mirrored (Kabsch 1976, with the sign of Umeyama 1991). A frame with fewer than three
+    joints in common has no unique rotation, and becomes NaN.
     """
     predictions, truth = np.asarray(predictions, np.float64), np.asarray(truth, np.float64)
     weights = _common(predictions, truth)
@@ -141,18 +141,18 @@ def align_rigid(predictions: ArrayLike, truth: ArrayLike) -> Floats:
     p = np.where(weights, predictions - center_p, 0)
     t = np.where(weights, truth - center_t, 0)
     u, _, vt = np.linalg.svd(np.swapaxes(p, 1, 2) @ t)
-    vt[:, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]  # a reflection fits better than it should
+    vt[:, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]  # no reflection
     aligned = (predictions - center_p) @ (u @ vt) + center_t
     aligned[weights.sum((1, 2)) < 3] = np.nan
     return aligned
 
 
 def jitter_mm(joints: ArrayLike, hands: ArrayLike | None = None) -> float:
-    """How far joints shake about a smooth path: RMS length of the second difference over frames, / sqrt(6).
+    """How much joints shake around a smooth path. It is the RMS length of the second difference over frames, / sqrt(6).
 
-    Uniform motion gives 0; independent noise whose RMS distance is r gives r (the second difference of such
-    noise has six times its variance). Real acceleration counts too, so where the truth is known pass
-    predictions - truth. Three consecutive frames with the joint are needed; NaN if there are none.
+    Uniform motion gives 0. Independent noise with an RMS distance of r gives r, because its second difference has six
+    times the variance. Real acceleration counts, too. So if the truth is known, pass predictions - truth. NaN if no
+    joint is there in three frames in a row.
 
     Args:
         joints: (N, J, 3) in metres, consecutive frames.
@@ -174,13 +174,13 @@ def bone_lengths_mm(joints: ArrayLike, skeleton: Skeleton) -> Floats:
 
 
 def bone_drift_mm(joints: ArrayLike, skeleton: Skeleton) -> Floats:
-    """Standard deviation (bones,) of each bone's length over time: 0 for a real hand, which is rigid."""
+    """Standard deviation (bones,) of the length of each bone over time. It is 0 for a real hand."""
     lengths = [column[np.isfinite(column)] for column in bone_lengths_mm(joints, skeleton).T]
     return np.array([column.std() if column.size else np.nan for column in lengths])
 
 
 def percentiles(values: ArrayLike) -> dict[str, float]:
-    """{'mean', 'p50', 'p90', 'p99', 'max'} of the finite values, in their unit; empty if there is none."""
+    """{'mean', 'p50', 'p90', 'p99', 'max'} of the finite values, in their unit. Empty if there is none."""
     found = _found(values)
     if not found.size:
         return {}
@@ -191,17 +191,20 @@ def percentiles(values: ArrayLike) -> dict[str, float]:
 
 def paired_bootstrap(a_mm: ArrayLike, b_mm: ArrayLike, *, block: int = 30, resamples: int = 10_000,
                      seed: int = 0) -> tuple[float, float, float]:
-    """Difference mean(a) - mean(b) over the same frames and its 95 % confidence interval: (difference, low, high).
+    """The difference mean(a) - mean(b) over the same frames, with its 95 % confidence interval.
 
-    Circular block bootstrap (Politis & Romano 1992): neighbouring frames of a video err alike, so runs of
-    `block` frames are drawn together; single frames (block = 1) would pretend to more evidence than there is.
-    Frames that either side lacks are left out.
+    This is a circular block bootstrap (Politis & Romano 1992). Neighbouring frames of a video have similar errors. So
+    `block` frames in a row are drawn together. With single frames (block = 1), the interval would be too narrow. Frames
+    that are missing on either side are left out.
 
     Args:
-        a_mm, b_mm: (N,) error of each frame, NaN or inf = absent.
+        a_mm, b_mm: (N,) error of each frame; NaN or inf = missing.
+
+    Returns:
+        (difference, low, high)
 
     Raises:
-        InputError: the lengths differ or fewer than two frames are common.
+        InputError: the lengths differ, or fewer than two frames are common.
     """
     a, b = np.asarray(a_mm, np.float64), np.asarray(b_mm, np.float64)
     if a.shape != b.shape or a.ndim != 1:
@@ -221,12 +224,12 @@ def paired_bootstrap(a_mm: ArrayLike, b_mm: ArrayLike, *, block: int = 30, resam
 
 def summarise(predictions: ArrayLike, truth: ArrayLike, skeleton: Skeleton,
               hands: ArrayLike | None = None) -> dict[str, Any]:
-    """Every accuracy number of a result, under the names that JSON files carry.
+    """All numbers of accuracy, by their names in JSON files. NaN becomes None.
 
-    Fractions are of labelled frames (`within_mm`, `auc_0_80`) or joints (`pck_mm`); NaN becomes None.
+    Fractions are of labelled frames (`within_mm`, `auc_0_80`) or of labelled joints (`pck_mm`).
 
     Args:
-        predictions, truth: (N, J, 3) in metres, J the joints of the skeleton.
+        predictions, truth: (N, J, 3) in metres, for the J joints of the skeleton.
         hands: see `jitter_mm`.
 
     Raises:
@@ -257,17 +260,17 @@ def summarise(predictions: ArrayLike, truth: ArrayLike, skeleton: Skeleton,
 
 
 def smoothness(predictions: ArrayLike, skeleton: Skeleton, hands: ArrayLike | None = None) -> dict[str, Any]:
-    """The numbers that need no truth: `jitter_mm`, and `bone_drift_mm` averaged over the bones."""
+    """The numbers that need no truth. They are `jitter_mm`, and the mean of `bone_drift_mm` over the bones."""
     return finite_or_none({'jitter_mm': jitter_mm(predictions, hands),
                            'bone_drift_mm': mean_mm(bone_drift_mm(predictions, skeleton))})
 
 
 SMOOTHNESS = ('error_jitter_mm', 'jitter_mm', 'bone_drift_mm')
-"""The numbers of `summarise` that need frames in the order of time."""
+"""The numbers of `summarise` for which the frames must follow each other in time."""
 
 
 def finite_or_none(value: Any) -> Any:
-    """The value with None for every NaN or inf in it, which JSON cannot hold."""
+    """The value, with None for every NaN or inf in it, because JSON has neither."""
     if isinstance(value, dict):
         return {key: finite_or_none(item) for key, item in value.items()}
     return value if not isinstance(value, float) or np.isfinite(value) else None
@@ -287,11 +290,11 @@ def _fraction_within(errors_mm: Floats, distances_mm: ArrayLike) -> Floats:
 
 
 def _common(a: Floats, b: Floats) -> NDArray[np.bool_]:
-    """(N, J, 1): both have the joint."""
+    """Whether both have the joint, (N, J, 1) bool."""
     return np.asarray(np.isfinite(a + b).all(-1, keepdims=True))
 
 
 def _center(points: Floats, weights: NDArray[np.bool_]) -> Floats:
-    """(N, 1, 3) mean over the joints of weight one; NaN where there is none."""
+    """Mean (N, 1, 3) over the joints with weight 1; NaN if there is none."""
     with np.errstate(invalid='ignore'):
         return np.where(weights, points, 0).sum(1, keepdims=True) / weights.sum(1, keepdims=True)

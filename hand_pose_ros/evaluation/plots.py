@@ -1,4 +1,4 @@
-"""Plots of results, one function each; all return a matplotlib Figure that `save` writes as PNG and SVG."""
+"""Plots of results. Each function returns a matplotlib Figure, and `save` writes it as PNG and SVG."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.evaluation.tables import number
 from hand_pose_ros.files import write_bytes
 
-# Okabe & Ito (2008): told apart with any colour vision, and in grey by their order of lightness.
+# Okabe & Ito (2008). They can be told apart with any colour vision, and in grey.
 COLORS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9', '#000000', '#B8A800')
 LINES = ('-', '--', ':', '-.')
-"""Of curves that must share a color."""
+"""Line styles, for curves that share a color."""
 LINE_INCHES = 0.19
 """Height of an entry of a legend."""
 LONGEST = 80
-"""Letters of a name that a legend has room for."""
+"""Maximum number of letters of a name in a legend."""
 
 _CJK = ('Noto Sans CJK JP', 'WenQuanYi Micro Hei', 'WenQuanYi Zen Hei', 'Droid Sans Fallback')
 """Fonts with Chinese, Japanese and Korean letters, which names of files may have."""
@@ -45,7 +45,7 @@ STYLE: dict[Any, Any] = {
 
 @matplotlib.rc_context(STYLE)
 def curves(results: Sequence[Result]) -> Figure:
-    """Fraction of frames whose every joint, and of joints that themselves, are within a distance."""
+    """Fraction of frames with all joints within a distance, and fraction of joints within it."""
     distances = np.linspace(0, 80, 321)
     figure, (left, right) = _figure(10.5, 4.1 + LINE_INCHES * len(results), 2)
     for k, (result, color) in enumerate(_colored(results)):
@@ -59,13 +59,13 @@ def curves(results: Sequence[Result]) -> Figure:
     right.set(title='Joints within', ylabel='joints, %')
     for axes in (left, right):
         axes.set(xlim=(0, 80), ylim=(0, 100), xlabel='distance, mm')
-    figure.legend(loc='outside lower left', fontsize=9)  # where it covers nothing, however many they are
+    figure.legend(loc='outside lower left', fontsize=9)  # outside, so that it never covers a curve
     return figure
 
 
 @matplotlib.rc_context(STYLE)
 def joint_bars(results: Sequence[Result]) -> Figure:
-    """Mean error of each joint, results side by side; they must have the same skeleton."""
+    """Mean error of each joint, for results side by side. They must have the same skeleton."""
     skeleton = results[0].skeleton
     rows = len(results) if len(results) > 1 else 0
     figure, (axes,) = _figure(max(7.0, 0.5 * len(skeleton) + 2), 4 + LINE_INCHES * rows)
@@ -85,7 +85,7 @@ def joint_bars(results: Sequence[Result]) -> Figure:
 
 @matplotlib.rc_context(STYLE)
 def over_time(result: Result) -> Figure:
-    """Mean and worst error of each frame, missed frames as marks at the foot; parts are separated."""
+    """Mean and worst error of each frame. Missed frames are marked at the bottom, and parts are separated."""
     errors = result.errors_mm
     means, worst = metrics.frame_means_mm(errors), metrics.worst_joints_mm(errors)
     figure, (axes,) = _figure(10.5, 3.4)
@@ -93,7 +93,7 @@ def over_time(result: Result) -> Figure:
     _band(axes, at, worst, COLORS[5], 'worst joint')
     _band(axes, at, means, COLORS[0], 'mean of joints')
     missed = metrics.missed_frames(errors)
-    highest = np.where(np.isfinite(worst), worst, means)  # a frame that lacks a joint has a mean all the same
+    highest = np.where(np.isfinite(worst), worst, means)  # if a joint was missed, there is only a mean
     highest = highest[np.isfinite(highest)]
     top = np.percentile(highest, 99.8) * 1.05 if highest.size else 0
     if missed.any():
@@ -111,11 +111,11 @@ def over_time(result: Result) -> Figure:
 
 @matplotlib.rc_context(STYLE)
 def latency(result: Result) -> Figure:
-    """Milliseconds of each stage in each frame, stacked: what a frame costs, and where."""
+    """Milliseconds of each stage in each frame, stacked."""
     at, label = _time_axis(result)
     stages = {stage: 1000 * np.nan_to_num(seconds) for stage, seconds in result.seconds.items() if stage != 'total'}
     if len(at) == 1:
-        at, stages = np.array([0.5, 1.5]), {stage: ms.repeat(2) for stage, ms in stages.items()}  # a width
+        at, stages = np.array([0.5, 1.5]), {stage: ms.repeat(2) for stage, ms in stages.items()}  # to have a width
     figure, (axes,) = _figure(10.5, 3.2)
     axes.stackplot(at, *stages.values(), labels=list(stages), colors=COLORS, lw=0, step='mid')
     total = np.sum(list(stages.values()), axis=0)
@@ -141,7 +141,7 @@ def save(figure: Figure, path: str | Path) -> None:
 
 
 def _figure(width: float, height: float, columns: int = 1) -> tuple[Figure, NDArray[np.object_]]:
-    """A figure and its row of axes. Without pyplot, so that no display is asked for and nothing is left behind."""
+    """A figure and its row of axes. Without pyplot, which needs a display and keeps every figure."""
     figure = Figure((width, height), layout='constrained')
     return figure, figure.subplots(1, columns, squeeze=False)[0]
 
@@ -151,7 +151,8 @@ def _colored(results: Sequence[Result]) -> list[tuple[Result, str]]:
 
 
 def _entry(result: Result) -> str:
-    """The name of a result in a legend, which leaves out what begins with _; a long one without its middle."""
+    """The name of a result in a legend. It begins with a blank, because legends leave out names that begin with _. A
+    long name loses its middle."""
     name, half = result.name, LONGEST // 2
     return f' {name}' if len(name) <= LONGEST else f' {name[:half]} … {name[-half:]}'
 
@@ -163,7 +164,7 @@ def _time_axis(result: Result) -> tuple[NDArray[np.float64], str]:
 
 
 def _band(axes: Axes, at: NDArray[np.float64], values: NDArray[np.float64], color: str, label: str) -> None:
-    """A line; of more frames than the picture has columns, the range of every few frames with their median."""
+    """A line through the values. If there are too many frames, the range and median of every few frames."""
     values = np.where(np.isfinite(values), values, np.nan)
     group = -(-len(values) // 800)
     if group == 1:

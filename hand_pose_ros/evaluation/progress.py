@@ -1,4 +1,4 @@
-"""How long work tells how far it is."""
+"""How long tasks report their progress."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
-"""Passes items on and shows how far it is; the number is how many there will be."""
+"""Called with items and their number. Passes the items on, and shows the progress."""
 
 
 def silent(items: Iterable[Any], total: int) -> Iterable[Any]:

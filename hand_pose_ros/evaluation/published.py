@@ -1,8 +1,8 @@
-"""Published results: the text format of the field, and the three datasets it is used for.
+"""Published results: the text format of the field, and the three datasets for which it is used.
 
-One frame a line, `u v d` for each joint: pixels and millimetres, separated by blanks, optionally behind a file
-name, optionally gzipped. Joints become metres in the optical frame (y down), also for NYU and MSRA whose own frames
-have y up: errors are distances and do not depend on it.
+A line is a frame, and has `u v d` for each joint, in pixels and millimetres, separated by blanks. A line may begin with
+the name of a file, and the file may be gzipped. Joints become metres in the optical frame (y down), also those of NYU
+and MSRA, whose own frames have y up. Errors are distances, so they do not depend on this.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from hand_pose_ros.skeleton import Skeleton, get_skeleton
 
 Rows = slice | NDArray[np.intp]
 Match = tuple[Rows, Rows, tuple[str, ...]]
-"""Which rows of the predictions and of the truth belong together, and what must be said about it."""
+"""Rows of the predictions, the rows of the truth that belong to them, and notes."""
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,9 @@ class Dataset:
     """A test set.
 
     Attributes:
-        intrinsics: of its depth images, in pixels.
-        parts: its sequences or subjects, name -> (first row, row after the last); empty if it has none.
-        published: (method, mean error in mm) as printed in the table of V2V-PoseNet (Moon et al. 2018).
+        intrinsics: of its depth images.
+        parts: its sequences or subjects, name -> (first row, row after the last). Empty if it has none.
+        published: (method, mean error in mm) from the table of V2V-PoseNet (Moon et al. 2018).
     """
 
     name: str
@@ -44,16 +44,16 @@ class Dataset:
 
     @property
     def frames(self) -> int:
-        """Number of test frames, 0 if it is not fixed."""
+        """Number of test frames; 0 = not fixed."""
         return max((stop for _, stop in self.parts.values()), default=0)
 
 
 DATASETS = {dataset.name: dataset for dataset in (
-    # The two test subjects of NYU (Tompson et al. 2014): the bone lengths of the labels change between the rows.
+    # NYU has two test subjects (Tompson et al. 2014). The bone lengths of the labels change between these rows.
     Dataset('nyu', Intrinsics(588.03, 587.07, 320, 240, 640, 480), get_skeleton('nyu14'),
             {'subject 1': (0, 2440), 'subject 2': (2440, 8252)},
             (('DeepPrior with refinement', 19.73), ('DeepModel', 17.04), ('DeepPrior++', 12.24))),
-    # DeepPrior's own code has 241.42 for both focal lengths of ICVL, which lowers means by about 0.013 mm.
+    # The code of DeepPrior has 241.42 for both focal lengths of ICVL, with which means are about 0.013 mm lower.
     Dataset('icvl', Intrinsics(240.99, 240.96, 160, 120, 320, 240), get_skeleton('icvl16'),
             {'sequence 1': (0, 702), 'sequence 2': (702, 1596)},
             (('LRF', 12.58), ('DeepPrior', 10.4), ('DeepPrior++', 8.1))),
@@ -64,17 +64,22 @@ DATASETS = {dataset.name: dataset for dataset in (
 
 @dataclass(frozen=True)
 class Labels:
-    """What a text file holds: `uvd` (N, J, 3), pixels and millimetres, and the file `names`, if any."""
+    """The content of a text file.
+
+    Attributes:
+        uvd: (N, J, 3), pixels and millimetres.
+        names: of the files of the frames; empty if the lines have none.
+    """
 
     path: Path
     uvd: NDArray[np.float64]
     names: tuple[str, ...] = ()
 
     def points(self, intrinsics: Intrinsics) -> NDArray[np.float64]:
-        """Joints (N, J, 3) in metres, optical frame; NaN where missing.
+        """Joints (N, J, 3) in metres, optical frame; NaN = missing.
 
-        A joint is missing if one of its numbers is not finite, or if its depth is 0 or less: result files write
-        0 0 0 for a joint that was not found.
+        A joint is missing if one of its numbers is not finite, or its depth is 0 or less. Files of results have 0 0 0
+        for a joint that was not found.
         """
         uvd = self.uvd.copy()
         uvd[~np.isfinite(uvd).all(-1) | (uvd[..., 2] <= 0)] = np.nan
@@ -82,11 +87,11 @@ class Labels:
 
 
 def read_text(path: str | Path, skeleton: Skeleton) -> Labels:
-    """Read a file of predictions or labels; blank lines are skipped.
+    """Read a file of predictions or labels. Blank lines are skipped.
 
     Raises:
-        InputError: the file cannot be read or is empty, a line has not 3 numbers for every joint of the skeleton,
-            or the depths are not millimetres.
+        InputError: the file cannot be read or is empty, a line does not have 3 numbers for each joint of the skeleton,
+            only some lines begin with a name, or the depths are not in millimetres.
     """
     path = Path(path)
     rows, names = [], []
@@ -123,11 +128,11 @@ def read_text(path: str | Path, skeleton: Skeleton) -> Labels:
 def load_published(predictions: str | Path, truth: str | Path, dataset: Dataset) -> Result:
     """Predictions and labels of a dataset, matched row by row.
 
-    Files with names on both sides are matched by name. Otherwise both must have the same number of rows, or one
-    of them that of a single part of the dataset: it is then matched to this part, and the result has a note of it.
+    If both files have names, they are matched by name. Otherwise both must have the same number of rows, or one of them
+    has all rows of the dataset and the other those of one part. In this case, a note says so.
 
     Raises:
-        InputError: a file is not as `read_text` wants it, or the rows cannot be matched.
+        InputError: a file cannot be read, see `read_text`, or the rows cannot be matched.
     """
     camera = dataset.intrinsics
     guess, label = read_text(predictions, dataset.skeleton), read_text(truth, dataset.skeleton)
@@ -150,19 +155,19 @@ def load_published(predictions: str | Path, truth: str | Path, dataset: Dataset)
 
 
 def split_source(source: str) -> tuple[str, str]:
-    """Name and path of `FILE` or `NAME=FILE`; the name is empty if none was given. A file's own name may hold a `=`."""
+    """Name and path of `FILE` or `NAME=FILE`. Without NAME, the name is empty. The name of FILE may contain a `=`."""
     name, equals, path = source.partition('=')
     return (name, path) if equals and not Path(source).exists() else ('', source)
 
 
 def named_apart(results: Sequence[Result], sources: Sequence[str]) -> list[Result]:
-    """The same results under names that differ.
+    """The results with different names.
 
-    One that has the name of another, without having been given it, is called by its file, with as many folders as it
-    takes; files that are the same are numbered.
+    If several results have the same name, those to which the user gave no name are named by their file, with as many
+    folders as needed. If names are still the same, they are numbered.
 
     Args:
-        sources: as in `load_result`, for each result; empty for one that comes from no file and keeps its name.
+        sources: of each result, as in `load_result`. It is empty for a result that is not from a file.
     """
     names = [result.name for result in results]
     given, paths = zip(*map(split_source, sources), strict=True)
@@ -176,13 +181,13 @@ def named_apart(results: Sequence[Result], sources: Sequence[str]) -> list[Resul
 
 
 def load_result(source: str, truth: str | Path | None = None, dataset: Dataset | None = None) -> Result:
-    """A result by `FILE` or `NAME=FILE`: an .npz file that `Result.save` wrote, or predictions as text.
+    """A result from `FILE` or `NAME=FILE`. It is an .npz file that `Result.save` wrote, or predictions as text.
 
     Args:
         truth, dataset: for text, as in `load_published`.
 
     Raises:
-        InputError: the file cannot be used, or it is text and there is no truth to it.
+        InputError: the file cannot be used, or it is text, and truth or dataset are missing.
     """
     name, path = split_source(source)
     if Path(path).suffix == '.npz':
@@ -224,7 +229,7 @@ def _match_names(guess: Labels, label: Labels) -> Match:
     note = (f'{guess.path.name} names {len(guess.names)} of the {len(label.names)} frames of {label.path.name}; '
             f'the other {left} are not scored.')
     rows = np.array([row[name] for name in guess.names])
-    order = rows.argsort()  # that of the dataset, whatever that of the predictions: parts and neighbours depend on it
+    order = rows.argsort()  # the order of the dataset, on which parts and neighbours depend
     return order, rows[order], (note,) if left else ()
 
 

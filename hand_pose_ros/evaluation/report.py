@@ -1,4 +1,4 @@
-"""One HTML file that shows what a result is worth: tables, curves, and the frames behind them. It works offline."""
+"""A report of results as one HTML file, with tables, curves and frames. It works offline."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from hand_pose_ros.skeleton import FINGERS
 
 Depth = NDArray[np.float32]
 ReadDepths = Callable[[Sequence[int]], Mapping[int, Depth]]
-"""Rows of the result -> their depth images (H, W) in metres, as far as there are any."""
+"""Rows of the result -> those of their depth images (H, W) in metres that exist."""
 
 _VIEW_SIDE_M = 0.30
 _CLOUD_POINTS = 2500
@@ -48,11 +48,11 @@ _DEFINITIONS = (
 
 
 def write_report(results: Sequence[Result], folder: str | Path, read_depths: ReadDepths | None = None) -> Path:
-    """Write report.html, and its plots alone as PNG and SVG, into a folder.
+    """Write report.html, and its plots as PNG and SVG, into a folder.
 
     Args:
-        results: the one that the report is about, then those it is compared with (of the same skeleton).
-        read_depths: gives the depth images behind the overlays and the 3D views.
+        results: first the result that the report is about, then those for comparison. All have the same skeleton.
+        read_depths: reads the depth images for the overlays and the 3D views.
 
     Returns:
         The path of report.html.
@@ -92,13 +92,13 @@ def write_report(results: Sequence[Result], folder: str | Path, read_depths: Rea
             'colors': ['rgb({},{},{})'.format(*FINGER_COLORS[finger]) for finger in result.skeleton.fingers]}),
         subtitle=f'{summary["frames_total"]} frames, {result.skeleton.name}, hand_pose_ros {__version__}')
     path = folder / 'report.html'
-    write_bytes(path, html.encode(errors='replace'))  # names of files may hold what is not UTF-8
+    write_bytes(path, html.encode(errors='replace'))  # names of files may not be UTF-8
     return path
 
 
 @dataclass(frozen=True)
 class _Card:
-    """A frame that is shown: its part of the page and the points of its 3D view."""
+    """A frame in the report: its part of the page, and the points of its 3D view."""
 
     html: str
     view: dict[str, Any]
@@ -133,10 +133,10 @@ def _cards(result: Result, read_depths: ReadDepths | None) -> list[_Card]:
 
 
 def _interesting_frames(result: Result) -> list[tuple[str, int]]:
-    """Best, median and worst frame; without truth the first, middle and last that has a hand."""
+    """Titles and rows of the best, median and worst frame. Without truth, the first, middle and last with a hand."""
     means = metrics.frame_means_mm(result.errors_mm)
     scored = np.isfinite(means)
-    names, order = ('Best', 'Median', 'Worst'), np.argsort(means)[:scored.sum()]  # what is not finite is last
+    names, order = ('Best', 'Median', 'Worst'), np.argsort(means)[:scored.sum()]  # those without a mean are last
     if not len(order):
         names, order = ('First', 'Middle', 'Last'), np.flatnonzero(np.isfinite(result.predictions).all((1, 2)))
     if not len(order):
@@ -148,7 +148,7 @@ def _interesting_frames(result: Result) -> list[tuple[str, int]]:
 
 
 def _cloud(depth: Depth, intrinsics: Intrinsics, cube: Cube) -> list[int]:
-    """Points of the surface within the cube, x y z x y z .. in whole millimetres from its centre."""
+    """Points of the surface in the cube, x y z x y z ..., in whole millimetres from its centre."""
     half = cube.side / 2
     v, u = np.nonzero((depth > max(cube.center[2] - half, 0)) & (depth < cube.center[2] + half))
     points = intrinsics.back_project(np.stack([u, v], -1), depth[v, u]) - np.array(cube.center)
@@ -177,7 +177,7 @@ def _figures(scored: Sequence[Result], result: Result) -> dict[str, Figure]:
 def _tiles(summary: dict[str, Any]) -> str:
     within = summary.get('within_mm', {})
     stages = summary.get('latency_ms', {})
-    latency = stages.get('total') or stages.get('image to joints', {})  # the live node tells no stages
+    latency = stages.get('total') or stages.get('image to joints', {})  # the live node has only this
     tiles = [
         ('mean error', number(summary.get('mean_mm'), 1, ' mm')),
         ('median of joints', number(summary.get('median_mm'), 1, ' mm')),
@@ -238,5 +238,5 @@ def _data_image(kind: str, data: bytes, alternative: str) -> str:
 
 
 def _script_json(value: Any) -> str:
-    """JSON that cannot end the script element it stands in."""
+    """JSON that cannot end the script element around it."""
     return json.dumps(value, allow_nan=False, separators=(',', ':')).replace('<', '\\u003c')

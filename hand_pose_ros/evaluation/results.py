@@ -1,4 +1,4 @@
-"""What an evaluation gives: joints, truth, times and their origin, kept together and saved as one file."""
+"""The result of an evaluation: joints, truth, times, and where they come from. It is saved as one file."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.skeleton import Skeleton
 
 FORMAT = 1
-"""Raised when files of the old form can no longer be read."""
+"""Version of the files. It is raised when older files cannot be read any more."""
 DAMAGE = (AttributeError, BadZipFile, EOFError, KeyError, NotImplementedError, TypeError, ValueError, zlib.error)
-"""What reading an .npz file raises that is damaged, or of another kind (AttributeError: with Python 3.10)."""
+"""The errors of reading an .npz file that is damaged or of another kind (AttributeError with Python 3.10)."""
 
 
 @dataclass(frozen=True)
@@ -31,17 +31,17 @@ class Result:
     """The joints of N frames.
 
     Attributes:
-        name: what tables and legends call it.
+        name: for tables and legends.
         intrinsics: of the depth images.
-        predictions: (N, J, 3) metres, optical frame; NaN = not predicted.
-        truth: the same, NaN = not labelled; None if there is none at all.
-        stamps_ns: (N,) of the depth images, or None.
-        seconds: stage -> (N,) time it took; NaN = did not run.
-        parts: name -> (first row, row after the last) of the subjects or sequences that are reported apart.
-        notes: whatever a reader of the numbers must know.
-        info: where it comes from: files, model, device, command.
-        in_time: each frame follows the one before; if not, nothing is told of jitter and bone drift.
-        hand_ids: (N,) str, of the tracked hand, or None if it is always the same; jitter is told within each hand.
+        predictions: (N, J, 3) in metres, optical frame; NaN = not predicted.
+        truth: (N, J, 3) in metres, optical frame; NaN = not labelled. None = no truth.
+        stamps_ns: (N,) stamps of the depth images, or None.
+        seconds: stage -> its times (N,); NaN = did not run.
+        parts: name -> (first row, row after the last), for subjects or sequences that are also reported separately.
+        notes: what a reader of the numbers must know.
+        info: where the result comes from (files, model, device, command).
+        in_time: whether each frame follows the one before. If not, jitter and bone drift are None.
+        hand_ids: (N,) str, of the tracked hand. Jitter is that within each hand. None = it is always the same hand.
     """
 
     name: str
@@ -59,13 +59,13 @@ class Result:
 
     @property
     def errors_mm(self) -> NDArray[np.float64]:
-        """(N, J), see `metrics.joint_errors_mm`; all NaN without truth."""
+        """Errors (N, J), see `metrics.joint_errors_mm`. Without truth, all are NaN."""
         if self.truth is None:
             return np.full(self.predictions.shape[:2], np.nan)
         return metrics.joint_errors_mm(self.predictions, self.truth)
 
     def summary(self) -> dict[str, Any]:
-        """Every number of the result, ready for JSON."""
+        """All numbers of the result, for JSON."""
         detected = np.isfinite(self.predictions).all(-1).any(-1)
         summary: dict[str, Any] = {'name': self.name, 'frames': len(self.predictions)}
         if self.truth is None:
@@ -74,7 +74,7 @@ class Result:
             summary |= self._accuracy(slice(None))
         summary |= {'frames_total': len(self.predictions),
                     'detection_rate': float(np.mean(detected)) if self.predictions.size else None}
-        if self.parts and self.in_time:  # hands of several subjects are not one hand that changes
+        if self.parts and self.in_time:  # the hands of several subjects are not one hand that changes
             summary['bone_drift_mm'] = metrics.finite_or_none(self._bone_drift_mm())
         if self.parts and self.truth is not None:
             summary['parts'] = {
@@ -85,7 +85,7 @@ class Result:
         return summary | {'notes': list(self.notes), **self.info}
 
     def _bone_drift_mm(self) -> float:
-        """The mean over the bones, each within the parts."""
+        """The mean over the bones of their drift within the parts."""
         rows = [slice(start, stop) for start, stop in self.parts.values()]
         drifts = np.array([metrics.bone_drift_mm(self.predictions[part], self.skeleton) for part in rows])
         frames = np.array([[part.stop - part.start] for part in rows]) * np.isfinite(drifts)
@@ -106,7 +106,7 @@ class Result:
         return summary if self.in_time else summary | dict.fromkeys(metrics.SMOOTHNESS)
 
     def save(self, path: str | Path) -> None:
-        """Write everything to an .npz file, which `load` reads and numpy.load too."""
+        """Write everything to an .npz file. `load` and numpy.load can read it."""
         meta = {'format': FORMAT, 'version': __version__, 'name': self.name, 'notes': self.notes,
                 'skeleton': asdict(self.skeleton), 'intrinsics': asdict(self.intrinsics),
                 'parts': dict(self.parts), 'info': dict(self.info), 'stages': list(self.seconds),
@@ -120,7 +120,7 @@ class Result:
 
     @classmethod
     def load(cls, path: str | Path) -> Result:
-        """Read what `save` wrote.
+        """Read a file of `save`.
 
         Raises:
             InputError: the file is missing, damaged, or of another kind.
@@ -146,5 +146,5 @@ class Result:
 
 
 def told_notes(results: Sequence[Result]) -> list[str]:
-    """The notes of all results; of several, each says whose it is."""
+    """The notes of all results. If there are several results, each note begins with the name of its result."""
     return [f'{result.name}: {note}' if len(results) > 1 else note for result in results for note in result.notes]

@@ -1,4 +1,4 @@
-"""Results as rows of text, the same in the terminal and in the report."""
+"""Results as rows of text, for the terminal and the report."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ ACCURACY_COLUMNS = ('frames', 'missed', 'mean', 'median', 'max', '<=20', '<=30',
 
 
 def accuracy_rows(name: str, summary: dict[str, Any]) -> list[tuple[str, ...]]:
-    """A row for a summary with truth, and one for each of its parts: the name, then the cells of ACCURACY_COLUMNS.
+    """A row for a summary with truth, and a row for each of its parts. A row is a name and the ACCURACY_COLUMNS.
 
-    Millimetres, and per cent of frames.
+    Numbers are in millimetres, and in per cent of frames.
     """
     parts = summary.get('parts', {}).items()
     return [(name, *_accuracy_cells(summary)), *((f'- {part}', *_accuracy_cells(its)) for part, its in parts)]
@@ -29,12 +29,12 @@ def _accuracy_cells(summary: dict[str, Any]) -> tuple[str, ...]:
 
 
 def number(value: float | None, digits: int, unit: str = '', factor: float = 1) -> str:
-    """A number with so many digits behind the point, or '-' for None and NaN."""
+    """A number with this many digits after the point. '-' for None and NaN."""
     return '-' if value is None or isnan(value) else f'{factor * value:.{digits}f}{unit}'
 
 
 def text_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Aligned columns for the terminal, the first one to the left."""
+    """A table with aligned columns for the terminal. The first column is aligned to the left."""
     table = [tuple(head), *map(tuple, rows)]
     widths = [max(len(row[k]) for row in table) for k in range(len(head))]
     return '\n'.join('  '.join(cell.ljust(width) if k == 0 else cell.rjust(width) for k, (cell, width) in

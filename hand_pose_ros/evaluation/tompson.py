@@ -1,4 +1,4 @@
-"""3D joints from 2D ones and the depth image: how the 2D network of Tompson et al. (2014) is compared in 3D."""
+"""3D joints from 2D joints and the depth image. So the 2D network of Tompson et al. (2014) is compared in 3D."""
 
 from __future__ import annotations
 
@@ -18,32 +18,34 @@ from hand_pose_ros.geometry import Intrinsics
 Protocol = Literal['paper', 'code']
 
 SIDES_M = {'subject 1': 0.300, 'subject 2': 0.249}
-"""Cube sides of DeepPrior: the second hand is 0.83 times as large."""
+"""Sides of the cubes of DeepPrior. The second hand is 0.83 times as large."""
 CODE_REACH_M = 0.150
+"""See `lift`."""
 
 
 def read_nyu_depths(folder: str | Path, rows: Sequence[int]) -> dict[int, NDArray[np.float32]]:
-    """Depth (H, W) in metres of those rows of the test set that a folder has, as depth_1_%07d.png, from 1 on."""
+    """Depth (H, W) in metres of those rows of the test set that are in a folder. Row 0 is depth_1_0000001.png."""
     paths = {row: Path(folder) / f'depth_1_{row + 1:07d}.png' for row in rows}
     return {row: read_nyu_depth(path) for row, path in paths.items() if path.is_file()}
 
 
 def lift(pixels: NDArray[np.float64], depth: NDArray[np.float32], intrinsics: Intrinsics, palm_z: float,
          side: float, truth_z: NDArray[np.float64], protocol: Protocol = 'paper') -> NDArray[np.float64]:
-    """Joints (J, 3) in metres from their pixels (J, 2) and the depth that is measured there.
+    """Joints (J, 3) in metres, from their pixels (J, 2) and the depth that is measured there.
 
-    Measured is the surface, not the joint, and beside a thin finger the background. What happens then decides the
-    comparison, and the paper and its code disagree:
+    The measured depth is that of the surface, not of the joint. Beside a thin finger, it is that of the background. So
+    what is done with it decides the comparison. The paper and its code disagree:
 
-    - 'paper': a depth outside the cube around the palm, or no reading, becomes that of the cube's back face
+    - 'paper': a depth outside the cube around the palm, or no reading, becomes the depth of the back face of the cube
       (Oberweger et al. 2015, section 4).
-    - 'code': a depth more than 150 mm from the labelled palm becomes the *labelled* depth of the joint, which
-      knows the answer and favours the method (public code of November 2016).
+    - 'code': a depth more than 150 mm from the labelled palm becomes the labelled depth of the joint (public code of
+      November 2016). This uses the answer, so it favours the method.
 
     Args:
-        depth: (H, W) metres, 0 = no reading.
-        palm_z: labelled depth of the palm, the middle of the cube; side: of the cube.
-        truth_z: (J,) labelled depths, which only 'code' looks at.
+        depth: (H, W) in metres, 0 = no reading.
+        palm_z: labelled depth of the palm in metres. The cube is centred there.
+        side: of the cube in metres.
+        truth_z: (J,) labelled depths in metres, for 'code'.
     """
     columns, rows = np.rint(np.nan_to_num(pixels, nan=-1)).astype(int).T
     inside = (columns >= 0) & (columns < depth.shape[1]) & (rows >= 0) & (rows < depth.shape[0])
@@ -59,15 +61,17 @@ def lift(pixels: NDArray[np.float64], depth: NDArray[np.float32], intrinsics: In
 
 def load_tompson(predictions: str | Path, truth: str | Path, folder: str | Path, dataset: Dataset,
                  protocol: Protocol = 'paper') -> Result:
-    """The 2D joints of an .npz file (`uv`: (N, 14, 2) pixels) on NYU, lifted with the depth frames of a folder.
+    """The 2D joints of an .npz file on NYU, lifted with the depth images of a folder.
 
-    Frames whose depth is not in the folder are not scored, and a note says how many.
+    Frames without a depth image are not scored. A note says how many there are.
 
     Args:
-        folder: with depth_1_%07d.png, the number of the row counted from 1.
+        predictions: .npz file with `uv` (N, 14, 2) in pixels.
+        truth: text file, see `published`.
+        folder: with the depth images, see `read_nyu_depths`.
 
     Raises:
-        InputError: a file is of another form, the counts differ, or the folder has none of the frames.
+        InputError: a file is of another form, the numbers of frames differ, or the folder has no depth image.
     """
     try:
         with np.load(predictions) as file:
@@ -83,7 +87,7 @@ def load_tompson(predictions: str | Path, truth: str | Path, folder: str | Path,
     lifted = np.full(points.shape, np.nan)
     there = []
     for row in range(dataset.frames):
-        for depth in read_nyu_depths(folder, [row]).values():  # one by one: all of them are 10 GB
+        for depth in read_nyu_depths(folder, [row]).values():  # one at a time, because all of them are 10 GB
             side = next(SIDES_M[part] for part, (start, stop) in dataset.parts.items() if start <= row < stop)
             lifted[row] = lift(pixels[row], depth, camera, points[row, PALM, 2], side, points[row, :, 2], protocol)
             there.append(row)

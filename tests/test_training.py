@@ -915,7 +915,7 @@ def test_a_network_starts_from_another_and_gets_a_prior_if_that_had_none(folder,
     monkeypatch.setitem(SKELETONS, 'other16', replace(get_skeleton('icvl16'), name='other16'))
     with pytest.raises(TrainingError, match='gives joints of other16, but icvl has those of icvl16'):
         tiny(folder, *wanted, f'base={path}', out=tmp_path / 'fourth')
-    with pytest.raises(TrainingError, match='need a hand_dense of these joints as the first'):
+    with pytest.raises(TrainingError, match='needs a hand_dense with the joints of icvl16'):
         tiny(folder, 'network=two_looks', f'first={path}', out=tmp_path / 'fifth')
 
 

@@ -1,10 +1,10 @@
-"""Fine-tuning to a camera of one's own, from a recording of a moving hand without labels.
+"""Fine-tunes a network to the user's camera, from a recording of a moving hand without labels.
 
-`look` takes crops of the hand out of a bag; by time, the first of them are learned from and the last ones judged on.
-`label` says where the joints are, better than one look of the network can: each crop is shown turned, moved and scaled
-in many ways (the literature calls it consistency, or test-time augmentation), and one hand is fitted through the means
-of the answers. `fine_tune` teaches that to the network, with as many synthetic hands in between, so that it forgets
-little.
+- `look` takes crops of the hand from a bag. The first part of the recording is for training, the last part for judging.
+- `label` finds better joints than one look of the network. It shows each crop turned, moved and scaled in many ways
+  (test-time augmentation), and fits one hand to the means of the answers.
+- `fine_tune` trains the network on these labels, and on as many synthetic hands, so that it forgets little.
+- `judge` measures the network before and after.
 """
 
 from __future__ import annotations
@@ -42,28 +42,30 @@ from hand_pose_ros.training.optimizers import learning_rate, make_optimizer
 from hand_pose_ros.training.recipes import RECIPES
 
 LEAST = 20
-"""Fewer images to learn from, or to judge on, say nothing."""
+"""Minimum number of images with a hand, both for training and for judging."""
 MOST = 1500
-"""Of a longer recording, images are left out evenly."""
+"""Maximum number of images for each. If there are more, images are left out evenly."""
 HELD_OUT, GAP, GAP_S = 0.25, 0.05, 1.0
-"""The last part of the time is held out; before it, this part of the time, or this many seconds, is not used at all:
-neighbouring images are alike."""
+"""The last part of the time is held out for judging. The gap before it is not used, because neighbouring images are
+alike. It is this part of the time, but at most this many seconds."""
 VIEWS = 12
+"""Number of ways in which a crop is shown to the network for its label."""
 VARIETY = Augmentation(rotation_deg=180, jitter=0.008, scale=1.2)
-"""How a crop is shown to the network for its label."""
+"""How a crop is changed for these."""
 AGREED_M = 0.012
-"""Answers that differ from their mean by more, on the average of the joints, are no label."""
+"""If the answers are further than this from their mean, on average over the joints, the image gets no label."""
 STEADY_M, STEADY_ROWS = 0.04, 4
-"""A hand that is this far from where it mostly is in the images around has been taken for something else."""
+"""If a hand is further than this from its median place in this many images around, it is something else."""
 BATCH = 16
-"""Recorded samples in a batch, and as many synthetic ones."""
+"""Number of recorded samples in a batch, and of synthetic ones."""
 RATE = 3e-4
+"""Learning rate."""
 WAY = 0.5
-"""How far to go from the old weights to the new ones. Half-way keeps more than half of what is gained, and a third of
-what is forgotten (robust fine-tuning, Wortsman et al. 2022)."""
+"""How far to go from the old weights to the new ones. Half of the way keeps more than half of the gain, but only a
+third of what is forgotten (robust fine-tuning, Wortsman et al. 2022)."""
 
 Numbers = dict[str, float | None]
-"""By name; None = not known. See `judge`."""
+"""By name; None = unknown. See `judge`."""
 
 
 @dataclass(frozen=True)
@@ -71,9 +73,9 @@ class Look:
     """What the estimator found in a bag.
 
     Attributes:
-        result: joints of every image, NaN where there is no hand, and the truth if there is one.
-        rows: (N,) int64, the images that the crops are of, ascending.
-        crops: as the network sees them; their joints are the estimates. Patches are float16.
+        result: joints of all images (NaN = no hand), and the truth if it is known.
+        rows: (N,) int64, ascending numbers of the images that the crops are from.
+        crops: as the network sees them. Their joints are the estimates. Patches are float16.
     """
 
     result: Result
@@ -81,14 +83,14 @@ class Look:
     crops: Batch
 
     def select(self, chosen: NDArray[np.bool_] | Tensor) -> tuple[Tensor, Batch]:
-        """Rows and crops of those images (of all, bool) that have a crop, at most `MOST`, patches as float32."""
+        """Rows and crops of the chosen images (a bool for each image), at most `MOST`. Patches are float32."""
         index = torch.as_tensor(chosen)[self.rows].nonzero()[:, 0]
         index = index[torch.linspace(0, len(index) - 1, min(len(index), MOST)).round().long()]
         crops = {key: value[index] for key, value in self.crops.items()}
         return self.rows[index], {**crops, 'patch': crops['patch'].float()}
 
     def split(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """The images to learn from and those to judge on, (images,) bool each, by time."""
+        """The images for training and those for judging, by time. Each is a bool for each image."""
         assert self.result.stamps_ns is not None
         time = (self.result.stamps_ns - np.min(self.result.stamps_ns)) / 1e9
         whole = float(np.max(time))
@@ -97,7 +99,7 @@ class Look:
 
 
 class _Crops:
-    """Keeps the crop of the first hand of each image, mirrored if it is a left one."""
+    """Keeps the crop of the first hand of each image. Left hands are mirrored."""
 
     def __init__(self) -> None:
         self._images = 0
@@ -113,7 +115,7 @@ class _Crops:
         self._images += 1
 
     def batch(self) -> tuple[Tensor, Batch]:
-        """Rows and crops; where the hand was once taken for one of the other side, there is none."""
+        """Rows and crops. Only hands of the side that most images show are kept."""
         sides = [side for _, side, *_ in self.samples]
         samples = [sample for sample in self.samples if sample[1] == max(set(sides), key=sides.count)]
         rows, _, patches, joints, centers, lengths = zip(*samples, strict=True) if samples else [()] * 6
@@ -126,45 +128,42 @@ class _Crops:
 
 
 def look(bag: str | Path, settings: Settings, progress: Progress) -> Look:
-    """Run the estimator over a bag.
+    """Run the estimator on a bag.
 
     Raises:
-        HandPoseError: bag, camera, truth or weights cannot be used.
+        HandPoseError: the bag, the camera, the truth or the weights cannot be used.
     """
     crops = _Crops()
     result = evaluate_bag(bag, settings, progress, lambda *_: nullcontext(crops))
     assert result.stamps_ns is not None
     if len(result.stamps_ns) > 1 and np.ptp(result.stamps_ns) == 0:
-        raise InputError(f'{bag}: all images have the stamp {result.stamps_ns[0]} ns, so what to learn from and what '
-                         'to judge on cannot be told apart by time: record it again, with a clock')
+        raise InputError(f'{bag}: all images have the stamp {result.stamps_ns[0]} ns, so the images to learn from and '
+                         'those to judge on cannot be separated by time: record it again with a running clock')
     return Look(result, *crops.batch())
 
 
 def require_hands(found: Look, bag: str | Path) -> None:
-    """Make sure that there is enough to learn from and to judge on.
-
-    Raises:
-        HandPoseError: there is not.
-    """
+    """Raise HandPoseError if there are not enough images with a hand, for training or for judging."""
     for part, name in zip(found.split(), ('learn from', 'judge on'), strict=True):
         if (count := int(torch.as_tensor(part)[found.rows].sum())) < LEAST:
             raise HandPoseError(f'{bag}: a hand was found in {count} of the {int(part.sum())} images to {name}, and '
-                                f'{LEAST} are needed: record one hand that moves before the camera for a minute or two '
-                                '(with --side, a hand of that side)')
+                                f'{LEAST} are needed: record one hand that moves in front of the camera for a minute '
+                                'or two (with --side, a hand of that side)')
 
 
 def consensus(predict: Callable[[NDArray[np.float32]], NDArray[np.float32]], crops: Batch,
               progress: Progress) -> tuple[Tensor, Tensor]:
-    """What a network says of each crop in many ways of showing it.
+    """The mean answer of a network to each crop, which it is shown in `VIEWS` ways.
 
     Args:
         predict: patches (N, 1, 128, 128) -> joints (N, J, 3) in cube units.
 
     Returns:
-        Mean joints (N, J, 3) in cube units of the crops, and how far the answers are from it on average, (N, J) metres.
+        Mean joints (N, J, 3) in cube units of the crops, and the mean distance of the answers from them (N, J) in
+        metres.
     """
     count = len(crops['patch'])
-    # Augmentation maps points affinely, so what it does with these four tells how to map answers back.
+    # Augmentation is an affine map of points. These four points show how to map the answers back.
     corners = torch.cat([torch.zeros(1, 3), torch.eye(3)]).expand(count, 4, 3)
     answers = []
     for view in progress(range(VIEWS), VIEWS):
@@ -181,7 +180,7 @@ def consensus(predict: Callable[[NDArray[np.float32]], NDArray[np.float32]], cro
 
 
 def label(engine: Engine, rows: Tensor, crops: Batch, progress: Progress) -> Batch:
-    """The crops that can be labelled, with labels as their joints.
+    """The crops that get a label. The labels are their joints.
 
     Raises:
         HandPoseError: there are too few.
@@ -194,8 +193,8 @@ def label(engine: Engine, rows: Tensor, crops: Batch, progress: Progress) -> Bat
     steady = (middle - torch.stack(around)).norm(dim=-1) <= STEADY_M
     keep = steady & (spread.mean(1) <= AGREED_M)
     if (count := int(keep.sum())) < LEAST:
-        raise HandPoseError(f'the network is sure of itself in only {count} of {len(rows)} images of the hand, and '
-                            f'{LEAST} are needed: record it nearer, with open fingers and nothing else in reach')
+        raise HandPoseError(f'the network is sure in only {count} of {len(rows)} images of the hand, and {LEAST} are '
+                            'needed: record it nearer, with open fingers and nothing else in reach')
     crops = {key: value[keep] for key, value in crops.items()}
     trust = 1 / (1 + (spread[keep] / 0.008) ** 2)
     fitted = fit_hand(points[keep], trust, rows[keep], _surface(crops))
@@ -203,7 +202,7 @@ def label(engine: Engine, rows: Tensor, crops: Batch, progress: Progress) -> Bat
 
 
 def _surface(crops: Batch, count: int = 64) -> Tensor:
-    """Some measured points of each crop, (N, count, 3) in metres; where there is nothing, points at the back face."""
+    """Some measured points of each crop, (N, count, 3) in metres. In an empty crop, they are at the back face."""
     depth = crops['patch'].flatten(1)
     size = crops['patch'].shape[-1]
     measured = ((depth < 1) & (depth > -1)).float() + 1e-9
@@ -214,13 +213,13 @@ def _surface(crops: Batch, count: int = 64) -> Tensor:
 
 
 def fine_tune(network: nn.Module, recorded: Batch, synthetic: Batch, steps: int, progress: Progress) -> nn.Module:
-    """A copy of a network for the joints of hand21, trained on labelled crops and synthetic ones, half and half, and
-    drawn back half of the way to what it was.
+    """A copy of a network for hand21, trained on labelled crops and on as many synthetic samples.
 
-    Of the crops it learns joints, and nothing else: labels that are its own say nothing about how far to trust it.
+    In the end, its weights go back half of the way to the old ones. From the crops it learns only joints. The labels
+    are its own, so they do not show how far to trust it.
     """
     original = list(network.parameters())
-    network = copy.deepcopy(network).requires_grad_(True).eval()  # norms keep their statistics: two sorts of samples
+    network = copy.deepcopy(network).requires_grad_(True).eval()  # norms keep their statistics
     recipe = replace(RECIPES['modern'], optimizer='adamw', learning_rate=RATE, warmup=0.1)
     objective = objective_for(network, recipe, HAND21)
     objective = objective.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -249,11 +248,13 @@ def fine_tune(network: nn.Module, recorded: Batch, synthetic: Batch, steps: int,
 
 
 def judge(found: Look, engine: Engine, progress: Progress) -> Numbers:
-    """Numbers of the held-out images.
+    """Numbers of the held-out images, by name:
 
-    found: share with a hand. error_mm: mean, where the truth is known. disagreement_mm: of the answers to one crop in
-    many ways. jitter_mm, bone_drift_mm: see `metrics`. explained: share of the depth that the joints explain, see
-    `scoring.explain`.
+    - found: share of the images with a hand
+    - error_mm: mean error, if the truth is known
+    - disagreement_mm: mean distance of the answers to one crop from their mean, see `consensus`
+    - explained: share of the depth that the joints explain, see `scoring.explain`
+    - jitter_mm, bone_drift_mm: see `metrics.smoothness`
     """
     held = found.split()[1]
     _, crops = found.select(held)
@@ -273,10 +274,11 @@ def judge(found: Look, engine: Engine, progress: Progress) -> Numbers:
 
 
 def is_better(before: Numbers, after: Numbers) -> bool:
-    """Whether numbers of `judge` speak for the adapted weights.
+    """Whether the numbers of `judge` are better for the adapted weights.
 
-    The truth decides where it is known. Else the answers must agree better and explain the depth no worse: agreement
-    alone is what is trained, and would come from a network that always says the same.
+    If the truth is known, the error decides. Otherwise the answers must agree better, and must not
+    explain the depth worse. Agreement alone is not enough, because a network that always gives the same answer agrees
+    best.
     """
     def smaller(name: str) -> bool:
         now, was = after[name], before[name]

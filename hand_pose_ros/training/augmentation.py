@@ -1,9 +1,9 @@
-"""One sample seen many ways: turned, moved and scaled in the plane of the patch, with noise and gaps.
+"""Shows one sample in many ways: turned, moved and scaled in the plane of the patch, with noise and gaps.
 
-The geometry is exact. Cube units follow the rays of the camera, so another cube around the same scene is an affine
-map of patch and joints, and a turn of the patch about its centre is a roll of the camera, if the centre of the cube is
-turned along. What the new cube sees beyond the old one is unknown and becomes background; but what was before the
-front face of the old one, and shown there, stays at that depth.
+The geometry is exact, because cube units follow the rays of the camera. Another cube around the same scene is an affine
+map of patch and joints. A turn of the patch about its centre is a roll of the camera, if the centre of the cube is
+turned with it. What the new cube contains and the old one did not is unknown, and becomes background. What was in front
+of the old cube was shown at its front face, and stays at that depth.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ from hand_pose_ros.synthetic.rng import Random
 
 @dataclass(frozen=True)
 class Augmentation:
-    """How much of each; zero switches it off."""
+    """How much of each. By default, nothing changes."""
 
     rotation_deg: float = 0.0
-    """Turn by an angle from +- this."""
+    """The patch is turned by up to this angle, to both sides."""
     jitter: float = 0.0
-    """Standard deviation of the shift of the centre, metres per axis."""
+    """Standard deviation of the shift of the centre of the cube, metres per axis."""
     jitter_tail: float = 0.0
     """Share of samples that are shifted three times as far."""
     scale: float = 1.0
     """The side of the cube is multiplied by a factor from [1 / scale, scale], uniform in its logarithm."""
     exclusive: bool = False
-    """Of shift, turn and nothing take one, with equal chances (DeepPrior++) instead of all."""
+    """Each sample is either shifted, or turned, or neither, with equal chances (DeepPrior++)."""
     noise: float = 0.0
-    """Noise of the readings: standard deviation up to this, metres."""
+    """Maximum standard deviation of the noise of a patch, metres."""
     dropout: float = 0.0
-    """Share of readings that are lost: up to this."""
+    """Maximum share of readings of a patch that are lost."""
     erase: float = 0.0
-    """Chance that a rectangle of 2 to 20 % of the patch is lost."""
+    """Share of samples that lose a rectangle of 2 to 20 % of the patch."""
     mirror: float = 0.0
-    """Share of samples shown with the wrong side (as if a left hand had not been mirrored)."""
+    """Share of samples that are shown as the wrong side, as if a left hand had not been mirrored."""
 
 
 PRESETS = {
@@ -55,8 +55,8 @@ def augment(batch: Batch, augmentation: Augmentation, numbers: Tensor, seed: int
     """Augmented copies of the samples, with `mirrored` (B,) bool added.
 
     Args:
-        batch: see `hand_pose_ros.datasets.base.Batch`; without a 'patch' only the geometry is augmented.
-        numbers: (B,) int64; what a sample gets depends on its number and `seed`, not on its neighbours.
+        batch: see `hand_pose_ros.datasets.base.Batch`. Without a 'patch', only the geometry is augmented.
+        numbers: (B,) int64. What happens to a sample depends on its number and `seed`, not on its neighbours.
     """
     joints = batch['joints']
     device = joints.device
@@ -65,7 +65,7 @@ def augment(batch: Batch, augmentation: Augmentation, numbers: Tensor, seed: int
     out['mirrored'] = random.fork(0).chance(augmentation.mirror)
     angle, scale, shift = _draw_geometry(random.fork(1), augmentation, batch['cube_side'])
 
-    # A point p of the patch plane becomes p' = (r R p - shift) / scale; r: the plane itself moves with the centre.
+    # A point p of the patch becomes p' = (r R p - shift) / scale. r is the new depth of the centre over the old one.
     center, half = batch['cube_center'], batch['cube_side'] / 2
     depth = center[:, 2] + shift[:, 2] * half
     r = depth / center[:, 2]
@@ -82,7 +82,7 @@ def augment(batch: Batch, augmentation: Augmentation, numbers: Tensor, seed: int
     if 'patch' in batch:
         patch = batch['patch']
         if augmentation.rotation_deg or augmentation.jitter or augmentation.scale != 1 or augmentation.mirror:
-            # From a pixel p' of the new patch back to p of the old one; nearest neighbour, as when a frame is cropped.
+            # From a pixel p' of the new patch back to p of the old one. Nearest neighbour, as when an image is cropped.
             inverse = rotation.mT / r[:, None, None]
             theta = torch.cat([inverse * scale[:, None, None], inverse @ shift[:, :2, None]], dim=-1)
             grid = F.affine_grid(theta, list(patch.shape), align_corners=False)
@@ -94,7 +94,7 @@ def augment(batch: Batch, augmentation: Augmentation, numbers: Tensor, seed: int
 
 
 def _draw_geometry(random: Random, augmentation: Augmentation, side: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Angle (B,) rad, factor of the cube's side (B,), shift of its centre (B, 3) in half sides."""
+    """Angle (B,) in radians, factor of the side of the cube (B,), and shift of its centre (B, 3) in half sides."""
     angle = random.uniform(low=-1, high=1) * math.radians(augmentation.rotation_deg)
     scale = torch.exp(random.uniform(low=-1, high=1) * math.log(augmentation.scale))
     far = torch.where(random.chance(augmentation.jitter_tail), 3.0, 1.0)
@@ -106,7 +106,7 @@ def _draw_geometry(random: Random, augmentation: Augmentation, side: Tensor) -> 
 
 
 def _degrade(patch: Tensor, random: Random, augmentation: Augmentation, side: Tensor) -> Tensor:
-    """Noise, lost readings and lost rectangles; the background (+1) has no reading to disturb."""
+    """Patches with noise, lost readings and lost rectangles. The background (+1) stays, because it has no readings."""
     size = patch.shape[-1]
     lost = patch == 1
     if augmentation.noise:
@@ -131,8 +131,10 @@ _BANK: dict[torch.device, Tensor] = {}
 
 
 def _noise(patch: Tensor, random: Random) -> Tensor:
-    """Normal numbers like `patch`: pieces of one long fixed sequence, as fresh ones for every pixel cost more than
-    a training step of a small network."""
+    """Normal numbers of the shape of `patch`. They are pieces of one long fixed sequence.
+
+    Fresh numbers for every pixel would take longer than a training step of a small network.
+    """
     if patch.device not in _BANK:
         generator = torch.Generator().manual_seed(0)
         _BANK[patch.device] = torch.randn(1 << 20, generator=generator).to(patch.device)

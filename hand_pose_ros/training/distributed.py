@@ -1,4 +1,4 @@
-"""Several processes, GPUs or nodes: torchrun starts them, DistributedDataParallel averages their gradients."""
+"""Training in several processes. torchrun starts them, and DistributedDataParallel averages their gradients."""
 
 from __future__ import annotations
 
@@ -28,6 +28,6 @@ def process_group(device: str) -> Iterator[None]:
     dist.init_process_group('nccl' if device.startswith('cuda') else 'gloo')
     try:
         yield
-        dist.barrier()  # the first process validates alone at the end: nobody takes the group down under its feet
+        dist.barrier()  # the first process validates alone at the end, and the others must not end the group before
     finally:
         dist.destroy_process_group()

@@ -1,6 +1,7 @@
-"""The experiments of the paper (section 4), each from one call: train what is missing, test, write the results.
+"""The experiments of the paper (section 4). Each is one call, which trains missing networks, tests, and writes results.
 
-Networks are trained once and shared by all experiments of a folder; a training run that was interrupted goes on.
+All experiments in a folder share their networks, so each is trained once. A training run that was interrupted is
+resumed.
 """
 
 from __future__ import annotations
@@ -38,16 +39,18 @@ from hand_pose_ros.training.validation import estimate, some_samples
 log = logging.getLogger(__name__)
 
 TEST_SAMPLES = 5000
-"""Of synthetic hands, which are then synthetic-test-v1; of a recorded dataset all test frames."""
+"""Number of synthetic test samples, which are those of synthetic-test-v1. Recorded datasets use all test frames."""
 WIDTHS = (None, 2, 4, 8, 16, 30)
-"""Of the bottleneck; None = direct regression."""
+"""Widths of the bottleneck; None = direct regression."""
 ITERATIONS = 4
+"""Maximum number of iterations of a refiner."""
 ROUNDS = 10
-"""Of timing, 10 calls each."""
+"""Rounds of `runtime.timing.measure`."""
 
 PAPER_MS = {'shallow': (0.07, 1.85), 'deep': (0.10, 2.08), 'multi_scale': (0.81, 5.36), 'deep-30': (0.09, 2.29),
             'deep-30 + or_ref': (2.38, 62.91)}
-"""Run times in the paper, of the network alone: GTX 780 Ti, and i7 CPU; refinement is told without its first stage."""
+"""Run times of the networks in the paper, in milliseconds (GTX 780 Ti, i7 CPU). Those of refinement are without the
+network before it."""
 
 
 @dataclass
@@ -55,8 +58,9 @@ class Laboratory:
     """Where experiments train and test.
 
     Args:
-        folder: gets runs/NAME for each network, and the results.
-        recipe: what all networks have in common; an experiment changes the network alone, so budgets are equal.
+        folder: for the results, and runs/NAME for each network.
+        recipe: what all networks have in common. An experiment changes only the network, so the budgets are equal.
+        machine: where to train.
     """
 
     folder: Path
@@ -64,15 +68,15 @@ class Laboratory:
     machine: Machine
 
     def __post_init__(self) -> None:
-        self.folder = self.folder.resolve()  # the recipe of a refiner names its base in there
+        self.folder = self.folder.resolve()  # the recipe of a refiner holds the path of its base
 
     def train(self, name: str, **changes: Any) -> Checkpoint:
-        """The trained network of this name; `changes` are those of its recipe."""
+        """The trained network with this name. `changes` replace values of the common recipe."""
         folder = RunFolder(self.folder / 'runs' / name)
         recipe = dataclasses.replace(self.recipe, **changes)
         started = folder.state.exists()
         if started and _resolved(folder.recipe()) != _resolved(recipe):
-            raise HandPoseError(f'{folder.path} was trained with another recipe; choose another --out, or delete it')
+            raise HandPoseError(f'{folder.path} was trained with another recipe: choose another --out, or delete it')
         if not (started and folder.checkpoint('last').exists() and load_progress(folder.state)['finished']):
             log.info('training %s', name)
             Run(folder.path, recipe, self.machine).train(resume=started)
@@ -82,21 +86,21 @@ class Laboratory:
         return self.train(label(architecture, width), network=architecture, options=self.options(width))
 
     def options(self, width: int | None) -> dict[str, Any]:
-        """Those of the recipe, with a bottleneck of this width."""
+        """The options of the common recipe, with a bottleneck of this width."""
         return {**self.recipe.options, 'bottleneck': width}
 
     def check_refiner(self) -> None:
-        """Raise HandPoseError if nothing would be left to train a refiner on: now, not after the first trainings."""
+        """Raise HandPoseError if no samples would be left to train a refiner, before any network is trained."""
         recipe = self.recipe
         with closing(open_shards(recipe, self.machine, 'train', torch.device('cpu'))) as shards:
             if shards.dataset.size is not None and recipe.last_shard is None:
                 count = -(-shards.dataset.size // recipe.shard_size)
-                raise HandPoseError(f'a refiner learns from frames that its base has not seen: leave it some of the '
-                                    f'{count} shards of {shards.dataset.name}, for example with --set last_shard='
+                raise HandPoseError('a refiner learns from frames that its base has not seen: leave some of the '
+                                    f'{count} shards of {shards.dataset.name} to it, for example with --set last_shard='
                                     f'{max(1, count * 4 // 5)}')
 
     def refined(self, refiner: str) -> Checkpoint:
-        """Deep-Prior with this refiner, which is trained on what lies behind the training data of Deep-Prior."""
+        """Deep-Prior with this refiner. The refiner is trained on the shards after those of Deep-Prior."""
         self.network('deep', 30)
         base = RunFolder(self.folder / 'runs' / label('deep', 30)).checkpoint('last')
         return self.train(f'deep-30-{refiner}', refiner=refiner, base=str(base), last_shard=None)
@@ -109,7 +113,7 @@ class Laboratory:
             return some_samples(shards, shards.dataset.size or TEST_SAMPLES)
 
     def result(self, name: str, checkpoint: Checkpoint) -> Result:
-        """What a network makes of the test samples, with the refiner of the checkpoint if it has one."""
+        """The joints that a network predicts for the test samples, refined if the checkpoint has a refiner."""
         network, refiner = checkpoint.network, checkpoint.refiner
 
         def predict(patch: torch.Tensor) -> torch.Tensor:
@@ -121,7 +125,7 @@ class Laboratory:
                        samples=checkpoint.metadata['samples'], dataset=self.recipe.dataset)
 
     def chain(self, name: str, checkpoint: Checkpoint, count: int) -> list[Result]:
-        """The same after 1 to `count` iterations of the refiner, each of which starts where the one before ended."""
+        """The results after 1, 2, ... `count` iterations of the refiner."""
         network, refiner = checkpoint.network, checkpoint.refiner
         skeleton = get_skeleton(checkpoint.metadata['skeleton'])
         assert refiner is not None
@@ -139,8 +143,10 @@ class Laboratory:
                         samples=checkpoint.metadata['samples'], dataset=self.recipe.dataset) for i in range(count)]
 
     def truth_through(self, width: int, skeleton: Skeleton) -> Result:
-        """What principal components of the true poses of the test keep of them: about as good as any network with a
-        bottleneck of this width can be."""
+        """The true poses of the test samples, projected onto their principal components.
+
+        No network with a bottleneck of this width can be much better.
+        """
         joints, center, side = (torch.cat([batch[key][batch['hand_present']] for batch in self.test])
                                 for key in ('joints', 'cube_center', 'cube_side'))
         poses = joints.flatten(1).numpy()
@@ -150,19 +156,19 @@ class Laboratory:
                        joints_in_metres(joints, center, side), dataset=self.recipe.dataset)
 
     def write(self, name: str, table: str, values: dict[str, Any], figure: Figure) -> str:
-        """NAME.json, NAME.md, NAME.png and NAME.svg; returns the table."""
+        """Write NAME.json, NAME.md, NAME.png and NAME.svg. Returns the table."""
         write_json(self.folder / f'{name}.json', {'recipe': recipe_to_dict(self.recipe), **values})
         write_bytes(self.folder / f'{name}.md', table.encode())
         plots.save(figure, self.folder / name)
         return table
 
     def write_results(self, name: str, results: Sequence[Result], figure: Figure) -> str:
-        """The same for results of networks."""
+        """Write the results of networks, as `write` does. Returns their table."""
         return self.write(name, accuracy_table(results), {'results': [result.summary() for result in results]}, figure)
 
 
 def _resolved(recipe: Recipe) -> Recipe:
-    """The same recipe, however the path of its base was written."""
+    """The recipe with an absolute path of its base, so that it can be compared."""
     return dataclasses.replace(recipe, base=recipe.base and str(Path(recipe.base).resolve()))
 
 
@@ -173,12 +179,12 @@ def _result(name: str, skeleton: Skeleton, estimates: torch.Tensor, truths: torc
 
 
 def label(architecture: str, width: int | None) -> str:
-    """What a network is called in tables: deep-30, deep-direct."""
+    """The name of a network in tables and folders, for example deep-30 or deep-direct."""
     return f'{architecture}-{width or "direct"}'
 
 
 def accuracy_table(results: Sequence[Result]) -> str:
-    """Markdown: mean and median error, and the share of frames whose worst joint is within a distance."""
+    """Markdown table of mean and median error, and of the share of frames whose worst joint is within a distance."""
     rows = ['| network | mean mm | median mm | <= 20 mm | <= 30 mm | <= 40 mm | <= 80 mm |', '|---' * 7 + '|']
     for result in results:
         s = result.summary()
@@ -188,7 +194,7 @@ def accuracy_table(results: Sequence[Result]) -> str:
 
 
 def networks(lab: Laboratory) -> str:
-    """Shallow, Deep, Multi-Scale, each direct and with bottlenecks of 8 and 30; and DeepPrior++."""
+    """Shallow, Deep and Multi-Scale, without the prior and with bottlenecks of 8 and 30, and DeepPrior++."""
     wanted = [(architecture, width) for architecture in ('shallow', 'deep', 'multi_scale') for width in (None, 8, 30)]
     results = [lab.result(label(*which), lab.network(*which)) for which in [*wanted, ('resnet', 30)]]
     best = sorted(results, key=lambda result: float(np.mean(result.errors_mm)))[:8]
@@ -196,7 +202,7 @@ def networks(lab: Laboratory) -> str:
 
 
 def bottleneck(lab: Laboratory) -> str:
-    """Width of the bottleneck of the Deep network, against direct regression (the paper's left figures)."""
+    """The Deep network with bottlenecks of several widths, and direct regression (the left figures of the paper)."""
     results = [lab.result(label('deep', width), lab.network('deep', width)) for width in WIDTHS]
     lab.write_results('bottleneck-curves', results, plots.curves(results))
     floors = [lab.truth_through(width, results[0].skeleton) for width in WIDTHS if width is not None]
@@ -204,7 +210,7 @@ def bottleneck(lab: Laboratory) -> str:
 
 
 def refinement(lab: Laboratory) -> str:
-    """No refinement, StdRef and ORRef, and the number of iterations (the paper's right figures)."""
+    """No refinement, and one to four iterations of StdRef and ORRef (the right figures of the paper)."""
     lab.check_refiner()
     results = [lab.result('deep-30', lab.network('deep', 30))]
     for refiner in REFINERS:
@@ -215,7 +221,7 @@ def refinement(lab: Laboratory) -> str:
 
 
 def joints(lab: Laboratory) -> str:
-    """Mean error of each joint, direct, with the prior, and refined (two iterations)."""
+    """Mean error of each joint with direct regression, with the prior, and with two iterations of refinement."""
     lab.check_refiner()
     results = [lab.result('deep-direct', lab.network('deep', None)), lab.result('deep-30', lab.network('deep', 30)),
                lab.result('deep-30 + or_ref x2', lab.refined('or_ref'))]
@@ -223,7 +229,7 @@ def joints(lab: Laboratory) -> str:
 
 
 def qualitative(lab: Laboratory) -> str:
-    """Estimate and truth on the depth image and on the point cloud from another angle, from good to bad."""
+    """Estimate and truth on the patch, and on its points from the side, for good to bad frames."""
     result = lab.result('deep-30', lab.network('deep', 30))
     order = np.argsort(result.errors_mm.mean(1))
     ranks = [int(share * (len(order) - 1)) for share in (0.05, 0.25, 0.5, 0.75, 0.95)]
@@ -232,7 +238,7 @@ def qualitative(lab: Laboratory) -> str:
 
 
 def runtime(lab: Laboratory) -> str:
-    """Milliseconds for one hand on this machine, beside the paper's; random weights take as long as trained ones."""
+    """Milliseconds for one hand, on this machine and in the paper. Weights are random, which takes the same time."""
     from hand_pose_ros.runtime import make_engine
     from hand_pose_ros.runtime.engine import Pipeline, TorchEngine
     from hand_pose_ros.runtime.timing import measure
@@ -256,7 +262,7 @@ def runtime(lab: Laboratory) -> str:
 
 
 def ingredients(lab: Laboratory) -> str:
-    """Deep-Prior trained on synthetic hands that lack one ingredient, or all, and tested on complete ones."""
+    """Deep-Prior, trained on synthetic hands that lack one or all ingredients, and tested on complete ones."""
     from hand_pose_ros.datasets.synthetic import INGREDIENTS
     if lab.recipe.dataset != 'synthetic':
         raise HandPoseError(f'--set dataset={lab.recipe.dataset}: only synthetic hands have ingredients to leave out')

@@ -1,4 +1,4 @@
-"""The figures of the experiments; each returns a matplotlib Figure."""
+"""The figures of the experiments. Each function returns a matplotlib Figure."""
 
 from __future__ import annotations
 
@@ -20,9 +20,12 @@ ESTIMATE, TRUTH = COLORS[0], COLORS[1]
 
 @matplotlib.rc_context(STYLE)
 def bottleneck(results: Sequence[Result], floors: Sequence[Result], widths: Sequence[int | None]) -> Figure:
-    """Mean error, and frames within 40 mm, over the width of the bottleneck; direct regression as a line.
+    """Mean error, and share of frames within 40 mm, over the width of the bottleneck.
 
-    `floors` are what as many components can hold of the truth, for each width that is not None.
+    Args:
+        results: one for each width.
+        floors: `Laboratory.truth_through` for each width that is not None.
+        widths: None = direct regression, which is drawn as a line.
     """
     figure = Figure((9, 3.6), layout='constrained')
     for axes, title, score in zip(
@@ -41,7 +44,7 @@ def bottleneck(results: Sequence[Result], floors: Sequence[Result], widths: Sequ
 
 @matplotlib.rc_context(STYLE)
 def iterations(results: Sequence[Result]) -> Figure:
-    """Mean error over the number of refinements; the first result is without any, the others are called 'NAME xN'."""
+    """Mean error over the number of refinements N. The first result has none, and the others are named 'NAME xN'."""
     figure = Figure((5.5, 3.8), layout='constrained')
     axes = figure.subplots()
     names = dict.fromkeys(result.name.rpartition(' x')[0] for result in results[1:])
@@ -57,7 +60,7 @@ def iterations(results: Sequence[Result]) -> Figure:
 
 @matplotlib.rc_context(STYLE)
 def runtime(rows: Mapping[str, Mapping[str, float]], paper_ms: Mapping[str, tuple[float, float]]) -> Figure:
-    """Milliseconds by network, here and in the paper (logarithmic); `rows` are called 'NAME|eager' and 'NAME|fast'."""
+    """Milliseconds of each network, here and in the paper. `rows` are named 'NAME|eager' and 'NAME|fast'."""
     figure = Figure((7.5, 3.6), layout='constrained')
     axes = figure.subplots()
     at = np.arange(len(paper_ms))
@@ -76,7 +79,7 @@ def runtime(rows: Mapping[str, Mapping[str, float]], paper_ms: Mapping[str, tupl
 
 @matplotlib.rc_context(STYLE)
 def qualitative(result: Result, batches: Sequence[Batch], rows: NDArray[np.int64]) -> Figure:
-    """A column per frame: the patch, and its points from the side, with estimate and truth."""
+    """A column for each frame. It shows the patch, and its points from the side, with the estimate and the truth."""
     present = torch.cat([batch['hand_present'] for batch in batches]).nonzero()[:, 0]
     whole = {key: torch.cat([batch[key] for batch in batches]) for key in ('cube_center', 'cube_side')}
     figure = Figure((2.7 * len(rows), 5.8), layout='constrained')
@@ -120,7 +123,7 @@ def _points(patch: torch.Tensor, center: torch.Tensor, side: torch.Tensor) -> to
 
 
 def _turned(points: torch.Tensor, center: torch.Tensor, degrees: float) -> NDArray[np.float32]:
-    """(N, 2): x and y relative to the centre after a turn about the vertical through it."""
+    """x and y (N, 2) relative to the centre, after a turn about the vertical axis through the centre."""
     x, y, z = (points - center).unbind(1)
     angle = np.radians(degrees)
     return torch.stack([x * np.cos(angle) + z * np.sin(angle), y], dim=1).numpy()

@@ -1,7 +1,7 @@
-"""One hand through a whole recording: the parametric hand, fitted to estimated joints and to depth by gradient descent.
+"""Fits the parametric hand to a whole recording, to estimated joints and to depth, by gradient descent.
 
-Estimates of single images know nothing of each other. A hand does: its bones keep their lengths, its joints keep
-within their limits, from one image to the next it does not jump, and its skin is where depth was measured.
+Estimates of single images know nothing of each other. But the bones of a hand keep their lengths, its joints stay
+within their limits, it does not jump from one image to the next, and its skin is where depth was measured.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from hand_pose_ros.synthetic.shapes import Shape, make_shape, mean_shape
 
 STEPS = 250
 RATE, RATE_M = 0.03, 0.002
-"""Step of Adam for what has no unit, and for the place of the wrist in metres."""
+"""Learning rate of Adam for values without a unit, and for the place of the wrist in metres."""
 KNEE_M = 0.008
-"""Joints further than this from their estimate pull no harder: they may be wrong."""
+"""An estimate that is further than this from its joint pulls no harder, because it may be wrong."""
 OFF_M = 0.015
-"""Depth further than this from the skin belongs to something else, and does not pull."""
+"""Depth that is further than this from the skin belongs to something else, and does not pull."""
 _PALM = [HAND21.joint_names.index(name) for name in ('wrist', 'index_mcp', 'middle_mcp', 'ring_mcp', 'pinky_mcp')]
-_ROOT_SPREAD = (0.04, 0.02, 0.25)  # of `shapes.sample_shapes`, as the other two below
+_ROOT_SPREAD = (0.04, 0.02, 0.25)  # standard deviations of `shapes.sample_shapes`, like 0.07 and 0.055 below
 
 
 def fit_hand(joints: Tensor, trust: Tensor, rows: Tensor, surface: Tensor) -> Tensor:
-    """The joints (N, 21, 3) of one right hand that moves as the estimates say, in metres.
+    """The joints (N, 21, 3) in metres of one right hand that moves as the estimates say.
 
     Args:
-        joints: (N, 21, 3) estimates in metres, hand21, of N images of the same hand.
-        trust: (N, 21) weight of each.
-        rows: (N,) int64 ascending numbers of the images: what follows each other directly may not jump.
-        surface: (N, P, 3) measured points of the hand and of what is around it, metres.
+        joints: (N, 21, 3) estimates in metres (hand21), of N images of the same hand.
+        trust: (N, 21) weights of the estimates.
+        rows: (N,) int64, ascending numbers of the images. The hand does not jump between images that follow each other.
+        surface: (N, P, 3) measured points of the hand and its surroundings in metres.
     """
     low, high = LIMITS.T
     start = _turn_to(joints)
@@ -69,13 +69,13 @@ def fit_hand(joints: Tensor, trust: Tensor, rows: Tensor, surface: Tensor) -> Te
 
 
 def _off_skin(points: Tensor, joints: Tensor, shape: Shape) -> Tensor:
-    """Mean distance in metres of points (N, P, 3) from the skin of hands, each bone with its flesh as a capsule.
+    """Mean distance in metres of points (N, P, 3) from the skin of hands. The skin is a capsule around each bone.
 
-    What is beyond the wrist may be the arm, and what is beyond `OFF_M`, anything: neither counts.
+    Points beyond the wrist do not count, because they may be the arm. Nor do points further away than `OFF_M`.
     """
     parents, children = zip(*HAND21.bones, strict=True)
     start, bone = joints[:, parents], joints[:, children] - joints[:, parents]
-    # The first bone of a finger is within the palm; the thumb has its own flesh from its root on.
+    # The first bone of a finger is within the palm. The thumb has its own flesh from its root on.
     palm = 0.9 * shape.palm_depth[:, None].expand(-1, 5)
     radius = torch.cat([palm[..., None], shape.radii], dim=2).flatten()
     offset = points[:, :, None] - start[:, None]
@@ -88,7 +88,7 @@ def _off_skin(points: Tensor, joints: Tensor, shape: Shape) -> Tensor:
 
 
 def _robust(offset: Tensor) -> Tensor:
-    """Length of offsets (..., 3) in millimetres, squared near zero."""
+    """Loss (...) of offsets (..., 3): their length in millimetres, but squared near zero."""
     length = 1000 * (offset.square().sum(-1) + 1e-12).sqrt()
     return F.smooth_l1_loss(length, torch.zeros_like(length), beta=1000 * KNEE_M, reduction='none')
 
@@ -100,14 +100,14 @@ def _joints(shape: Shape, pose: Tensor) -> Tensor:
 
 
 def _rotation(turn: Tensor) -> Tensor:
-    """(N, 3, 3) from two columns, (N, 6), which need be neither long one nor square (Zhou et al. 2019)."""
+    """Rotations (N, 3, 3) from any two columns (N, 6). They are made orthonormal (Zhou et al. 2019)."""
     x, y = F.normalize(turn[:, :3], dim=-1), turn[:, 3:]
     y = F.normalize(y - (x * y).sum(-1, keepdim=True) * x, dim=-1)
     return torch.stack([x, y, torch.linalg.cross(x, y)], dim=-1)
 
 
 def _turn_to(joints: Tensor) -> Tensor:
-    """Rotations (N, 3, 3) that lay the palm of a mean hand onto that of the estimates (Kabsch 1976)."""
+    """Rotations (N, 3, 3) that turn the palm of a mean hand to the palms of the estimates (Kabsch 1976)."""
     palm = _joints(mean_shape(), torch.zeros(1, len(POSE)))[:, _PALM]
     palm, seen = palm - palm.mean(1, keepdim=True), joints[:, _PALM] - joints[:, _PALM].mean(1, keepdim=True)
     u, _, vt = torch.linalg.svd(seen.mT @ palm)

@@ -1,4 +1,4 @@
-"""The folder of a run: what was trained, how it went, and what came out."""
+"""The folder of a training run: its recipe, its progress, and its checkpoints."""
 
 from __future__ import annotations
 
@@ -18,15 +18,17 @@ log = logging.getLogger(__name__)
 
 
 class TrainingError(HandPoseError):
-    """Training that cannot start or go on."""
+    """Training cannot start or go on."""
 
 
 class RunFolder:
-    """Files of one run.
+    """The files of one run:
 
-    config.json (recipe, git revision) · state.safetensors (to resume) · last.safetensors and best.safetensors
-    (checkpoints to use) · metrics.jsonl · log.txt · TensorBoard events, if it is installed · .lock
-    (see `lock`).
+    - config.json: the recipe and the git revision
+    - state.safetensors: everything that is needed to resume the run
+    - last.safetensors, best.safetensors: checkpoints
+    - metrics.jsonl, log.txt, and events for TensorBoard if it is installed
+    - .lock: see `lock`
     """
 
     def __init__(self, path: Path) -> None:
@@ -37,14 +39,14 @@ class RunFolder:
         self._lock = FileLock(path / '.lock')
 
     def checkpoint(self, name: str) -> Path:
-        """'best' or 'last'."""
+        """The file of the checkpoint 'best' or 'last'."""
         return self.path / f'{name}.safetensors'
 
     def recipe(self) -> Recipe:
-        """What the run was started with.
+        """The recipe of the run.
 
         Raises:
-            TrainingError: there is no run here.
+            TrainingError: there is no run in this folder.
         """
         try:
             return recipe_from_dict(json.loads((self.path / 'config.json').read_text())['recipe'])
@@ -59,10 +61,10 @@ class RunFolder:
             raise TrainingError(f'{self.path} holds a run already: continue it with --resume, or choose another --out')
 
     def lock(self) -> None:
-        """Keep others from writing here until `close`, or until this process ends.
+        """Keep other processes from training in this folder, until `close` or the end of this process.
 
         Raises:
-            TrainingError: another process writes here.
+            TrainingError: another process trains in this folder.
             InputError: the folder cannot be made or written.
         """
         check_writable(self.path / '.lock')
@@ -71,11 +73,11 @@ class RunFolder:
         except Timeout:
             raise TrainingError(f'{self.path}: another process trains in this folder: wait for its end, or choose '
                                 'another --out') from None
-        for left in self.path.glob('.*.safetensors.*.part'):  # by a process that was killed, which held the lock
+        for left in self.path.glob('.*.safetensors.*.part'):  # left by a process that was killed
             left.unlink(missing_ok=True)
 
     def create(self, recipe: Recipe) -> None:
-        """Start a new run here.
+        """Write config.json of a new run.
 
         Raises:
             TrainingError: the folder holds a run already.
@@ -84,7 +86,7 @@ class RunFolder:
         write_json(self.path / 'config.json', {'recipe': recipe_to_dict(recipe), 'git': _git_revision()})
 
     def open(self, step: int, samples: int) -> None:
-        """Begin to write; what was written after this step, or so many samples, of a run that goes on is forgotten."""
+        """Open the logs. If the run is resumed, what they hold after this step (or number of samples) is removed."""
         metrics = self.path / 'metrics.jsonl'
         if metrics.exists():
             lines = metrics.read_text('utf-8', 'replace').splitlines(keepends=True)
@@ -101,7 +103,7 @@ class RunFolder:
             log.info('no events for TensorBoard: it is not installed')
 
     def write(self, values: dict[str, Any]) -> None:
-        """A line of metrics.jsonl, with the count of 'samples' in it."""
+        """Add a line to metrics.jsonl, and the same values to TensorBoard. One of them must be 'samples'."""
         with open(self.path / 'metrics.jsonl', 'a', encoding='utf-8') as file:
             file.write(json.dumps(values) + '\n')
         if self._tensorboard is not None:
@@ -109,7 +111,7 @@ class RunFolder:
                 self._tensorboard.add_scalar(name, value, values['samples'])
 
     def close(self) -> None:
-        """End writing, and let others write."""
+        """Close the logs and release the lock."""
         self._lock.release()
         if self._tensorboard is not None:
             self._tensorboard.close()
@@ -121,7 +123,7 @@ class RunFolder:
 def _step(line: str) -> float:
     try:
         return float(json.loads(line)['step'])
-    except (ValueError, KeyError, TypeError):  # damaged, or the last one of a process that was killed
+    except (ValueError, KeyError, TypeError):  # damaged, or the last line of a process that was killed
         return float('inf')
 
 

@@ -1,4 +1,4 @@
-"""Loss and gradients of one batch after another."""
+"""Loss and gradients of one batch after another, on a GPU in one launch."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from hand_pose_ros.training.losses import Terms
 
 
 class Gradients:
-    """`gradients(batch)` returns the terms of the loss; of their sum the parameters hold the gradients afterwards.
+    """`gradients(batch)` returns the terms of the loss. Afterwards the parameters hold the gradients of their sum.
 
-    Launching the thousand small kernels of a step takes a processor longer than a GPU needs for them. There they are
-    launched as one, a CUDA graph, captured after a few batches, which later ones run through; so all are of the same
-    shapes, and nothing in the module may wait for the GPU or copy something there.
+    A step has a thousand small kernels. A CPU needs longer to launch them than a GPU needs to run them. So they are
+    captured as one CUDA graph after a few batches, and later batches run through the graph. All batches must have the
+    same shapes, and the module must neither wait for the GPU nor copy anything to it.
 
     Args:
-        module: from a batch to the terms.
-        precision: makes the context in which it runs.
-        captured: as a CUDA graph.
+        module: maps a batch to the terms of the loss.
+        precision: makes the context in which the module runs.
+        captured: whether to capture a CUDA graph.
     """
 
     def __init__(self, module: nn.Module, precision: Callable[[], AbstractContextManager[Any]], captured: bool) -> None:
@@ -46,7 +46,7 @@ class Gradients:
             tensor.copy_(batch[name])
         self._graph.replay()
         for parameter, gradient in zip(self._parameters, self._gradients, strict=True):
-            parameter.grad = gradient  # which an optimiser may have taken away
+            parameter.grad = gradient  # an optimiser may have removed it
         return self._terms
 
     def _compute(self, batch: Batch) -> Terms:

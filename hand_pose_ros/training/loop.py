@@ -1,4 +1,4 @@
-"""The training loop."""
+"""One training run: the loop, its validation, and how it is stopped and resumed."""
 
 from __future__ import annotations
 
@@ -40,29 +40,30 @@ from hand_pose_ros.training.validation import estimate, some_samples
 log = logging.getLogger(__name__)
 
 TOLD_EVERY_S = 60.0
-"""Seconds between two lines about the progress in a log, which shows no bar."""
+"""Seconds between two lines about the progress, where no terminal shows a bar."""
 
 
 @dataclass(frozen=True)
 class Machine:
-    """Where to train; on a CPU nothing here but the number of threads touches the result."""
+    """Where to train. On a CPU, only the number of threads can change the result."""
 
     cache: Path
     """Folder of rendered and decoded samples, shared by all runs."""
     device: str = 'cpu'
-    """A name of PyTorch's, 'cuda:1' for example."""
+    """A device of PyTorch, for example 'cuda:1'."""
     workers: int = 1
-    """Processes that render or decode; 0 = in this process, on `device`, kept in its memory."""
+    """Number of processes that render or decode. With 0, this process does it on `device`, and keeps the samples in
+    memory."""
     threads: int | None = None
-    """Of PyTorch in this process; None leaves them to it."""
+    """Number of threads of PyTorch in this process; None = its default."""
     limit_gb: float = 40.0
-    """Of the cache."""
+    """Maximum size of the cache."""
     save_every_s: float = 120.0
-    """Seconds between two writings of the state to resume from."""
+    """Seconds after which the state of the run is saved again."""
 
 
 def open_shards(recipe: Recipe, machine: Machine, split: str, device: torch.device) -> DiskShards | MemoryShards:
-    """The samples that a recipe asks for, as this machine makes them."""
+    """The samples of a recipe, made as the machine says."""
     opening = partial(open_dataset, recipe.dataset, split, Path(recipe.root) if recipe.root else None,
                       str(device) if machine.workers == 0 else 'cpu')
     if machine.workers == 0:
@@ -74,7 +75,7 @@ class Run:
     """One training run: `Run(folder, recipe, machine).train()`.
 
     Raises:
-        HandPoseError: data, base checkpoint or a value of the recipe cannot be used; the sentence says which.
+        HandPoseError: the data, a checkpoint or a value of the recipe cannot be used.
     """
 
     def __init__(self, folder: Path, recipe: Recipe, machine: Machine) -> None:
@@ -87,60 +88,61 @@ class Run:
         if machine.threads:
             torch.set_num_threads(machine.threads)
         self._stop = self._waiting = self._ending = False
-        check_device(machine.device)  # now, not after minutes of rendering
+        check_device(machine.device)  # before minutes of rendering
         self.device = torch.device(machine.device)
         if self.device.type == 'cuda' and 'LOCAL_RANK' in os.environ:
             self.device = torch.device('cuda', int(os.environ['LOCAL_RANK']))
         if self.device.type == 'cuda' and self.device.index is not None:
-            torch.cuda.set_device(self.device)  # the current one is where graphs are captured
+            torch.cuda.set_device(self.device)  # graphs are captured on the current device
 
         torch.manual_seed(recipe.seed)
         self.base = load_checkpoint(recipe.base) if recipe.base else None
         self.shards = open_shards(recipe, machine, 'train', self.device)
         self.skeleton = self.shards.dataset.skeleton
-        # Now, not after the first 65,536 samples, for it may not be there.
+        # Opened now, so that missing validation data are an error before the training.
         self._val_shards = open_shards(recipe, machine, 'val', self.device)
         if (other := self._val_shards.dataset.skeleton.name) != self.skeleton.name:
             raise TrainingError(f'{self._val_shards.dataset.name} has joints of {other}, but '
-                                f'{self.shards.dataset.name} those of {self.skeleton.name}: they must be the same')
+                                f'{self.shards.dataset.name} those of {self.skeleton.name}: both must have the same')
         if recipe.last_shard is not None and self.shards.dataset.size is None:
-            raise TrainingError(f'--set last_shard={recipe.last_shard} is for recorded datasets: {recipe.dataset} '
-                                'has no end; --set samples=N says how much of it is seen')
+            raise TrainingError(f'--set last_shard={recipe.last_shard} is for recorded datasets, but {recipe.dataset} '
+                                'has no end: choose the number of its samples with --set samples=N')
         begin = first_shard(recipe, self.base, self.shards.dataset)
         self.stream = SampleStream(self.shards, recipe.batch_size, recipe.seed, recipe.reuse, begin, recipe.last_shard,
                                    (self.rank, self.world))
         first = load_checkpoint(recipe.first) if recipe.first else None
-        # What they have seen, the new weights have seen.
+        # What the networks that it starts from have seen, the new network has seen.
         self._seen = max(shards_seen(recipe, each, self.shards.dataset) for each in (self.base, first))
         self.budget = recipe.samples or recipe.epochs * (self.stream.epoch_size or EPOCH_OF_ENDLESS_DATA)
         self.steps = -(-self.budget // recipe.batch_size)
 
-        # Channels last is what fast convolutions of few channels want, and twice as fast for them on a CPU.
         with self._signals(), self._interruptible():
             try:
                 objective = make_objective(recipe, self.base, self.shards, self.stream.window(0)).to(self.device)
             except BaseException:
                 self.shards.close()
                 raise
+        # On a CPU, convolutions of few channels are twice as fast with channels last.
         self.objective = objective.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.averaged = copy.deepcopy(self.objective) if recipe.average else self.objective
         self.optimizer = make_optimizer(recipe, self.objective)
         self._next: Batch | None = None
         self._aside = torch.cuda.Stream(self.device, priority=-1) if self.device.type == 'cuda' else None
         self.step, self.best_mm = 0, float('inf')
-        self._validated = 0  # step
+        self._validated = 0
+        """Step of the last validation."""
         self._result: dict[str, Any] = {}
-        """Of the last validation."""
+        """Result of the last validation."""
         self._saved = time.monotonic()
 
     # The loop
 
     def train(self, resume: bool = False) -> dict[str, Any]:
-        """Train to the end of the budget and return the last validation.
+        """Train to the end of the budget. Returns the result of the last validation.
 
         Raises:
-            TrainingError: the folder holds a run already (or none to resume), the loss is not finite any more, or a
-                signal ended the run.
+            TrainingError: the folder holds a run already, the loss is not finite any more, or a signal ended the run.
+            CheckpointError: `resume`, but the folder has no state to resume from, or a damaged one.
         """
         with self._signals():
             try:
@@ -186,7 +188,7 @@ class Run:
         told = at
         with tqdm(total=self.budget, initial=self.step * recipe.batch_size, unit='samples', unit_scale=True,
                   smoothing=0.05, disable=self.rank > 0 or None, dynamic_ncols=True) as bar:
-            if self._validated < self.step and self._to_validate():  # the run was stopped before it had
+            if self._validated < self.step and self._to_validate():  # the run was stopped before this validation
                 self._validate()
             while self.step < self.steps:
                 terms = self._train_step(gradients)
@@ -197,7 +199,7 @@ class Run:
                     bar.set_postfix({**values, **self._result})
                     rate = (self.step - since) * recipe.batch_size / (time.monotonic() - at)
                     since, at = self.step, time.monotonic()
-                    if bar.disable and at - told > TOLD_EVERY_S:  # no terminal: a line now and then
+                    if bar.disable and at - told > TOLD_EVERY_S:
                         told = at
                         log.info('%s of %s samples, %.0f/s, %s', f'{done:,}', f'{self.budget:,}', rate, values)
                     self.folder.write({'step': self.step, 'samples': done, **values, 'rate': round(rate, 1),
@@ -205,19 +207,19 @@ class Run:
                 if self._ending and not last:
                     raise KeyboardInterrupt
                 if self._to_validate():
-                    self._save()  # what is trained is not to be lost with a validation that fails
+                    self._save()  # a validation that fails must not lose what was trained
                     self._validate()
                 elif time.monotonic() - self._saved > self.machine.save_every_s:
                     self._save()
         return self._result
 
     def _to_validate(self) -> bool:
-        """Whether the last step is one to validate after."""
+        """Whether to validate after the last step."""
         done, size, every = self.step * self.recipe.batch_size, self.recipe.batch_size, self.recipe.val_every
         return self.step >= self.steps or done // every > (done - size) // every
 
     def _train_step(self, gradients: Gradients) -> Terms:
-        """One step; all it depends on are the weights, the state of the optimiser, the recipe and the step's number."""
+        """One step. It depends only on the weights, the state of the optimiser, the recipe and its number."""
         recipe = self.recipe
         for group in self.optimizer.param_groups:
             group['lr'] = learning_rate(recipe, self.step / self.steps)
@@ -235,26 +237,26 @@ class Run:
         self.step += 1
         try:
             if self._aside and self.step < self.steps:
-                self._prepare()  # while the GPU is at the present one
-        finally:  # also when a signal ends the wait: a spoilt state must not be saved
+                self._prepare()  # while the GPU computes this step
+        finally:  # also if a signal ends the wait, because a spoilt state must not be saved
             self._check(batch, terms)
         return terms
 
     def _prepare(self) -> None:
-        """The batch of the next step, on the device and augmented."""
+        """Load the batch of the next step to the device, and augment it."""
         with self._interruptible(), torch.cuda.stream(self._aside) if self._aside else nullcontext():
             batch, numbers = self.stream.batch(self.step)
             batch = {key: value.to(self.device, non_blocking=True) for key, value in batch.items()}
             batch = augment(batch, self.recipe.augmentation, numbers, self.recipe.seed)
-            # Another shift than in `augment`, so that an objective draws other numbers.
+            # Not shifted as in `augment`, so that an objective draws other random numbers.
             batch['numbers'] = numbers.to(self.device) + (self.recipe.seed << 41)
         self._next = batch
 
     def _check(self, batch: Batch, terms: Terms) -> None:
-        """That the loss of the step just made is finite, and whether the run is to end after it."""
+        """Make sure that the loss of the last step is finite, and find out whether the run must end after this step."""
         loss = torch.stack(list(terms.values())).sum()
         self._ending = self._stop
-        if self.world > 1:  # all of them stop when one has to, after the same step
+        if self.world > 1:  # if one process must stop, all stop after the same step
             shared = torch.stack([loss, loss.new_tensor(float(self._stop))])
             dist.all_reduce(shared)
             loss, self._ending = shared[0], bool(shared[1])
@@ -267,9 +269,9 @@ class Run:
 
     @torch.no_grad()
     def _update_average(self) -> None:
-        decay = min(self.recipe.average, (1 + self.step) / (10 + self.step))  # the random start is forgotten soon
-        # Buffers, too: the running statistics of the last ten batches are those of the last weights, and noisy;
-        # averaged ones are worth millimetres while the learning rate is high.
+        decay = min(self.recipe.average, (1 + self.step) / (10 + self.step))  # the random start is soon forgotten
+        # Buffers, too. Running statistics are noisy and belong to the last weights. While the learning rate is high,
+        # averaging them is worth millimetres.
         mine, theirs = ([*module.parameters(), *module.buffers()] for module in (self.averaged, self.objective))
         moving = [i for i, tensor in enumerate(mine) if tensor.is_floating_point()]
         torch._foreach_lerp_([mine[i] for i in moving], [theirs[i] for i in moving], 1 - decay)
@@ -281,8 +283,8 @@ class Run:
         path = self.folder.path / f'failed_batch_{step}_{self.rank}.safetensors'
         values = {name: str(value.item()) for name, value in terms.items()}
         save_tensors(path, batch, {'step': step, 'terms': values})
-        raise TrainingError(f'the loss of step {step} is not finite ({values}); the batch is in {path}. If it '
-                            f'looks right, train anew with a learning_rate below {self.recipe.learning_rate}')
+        raise TrainingError(f'the loss of step {step} is not finite ({values}); its batch is in {path}. If the batch '
+                            f'looks right, train again with a learning_rate below {self.recipe.learning_rate}')
 
     def _distributed(self) -> nn.Module:
         if self.world == 1:
@@ -293,7 +295,7 @@ class Run:
 
     @contextmanager
     def _signals(self) -> Iterator[None]:
-        """SIGTERM and Ctrl-C end the run after the step that is under way, or at once while it waits for samples."""
+        """SIGTERM and Ctrl-C end the run after the current step, or at once while it waits for samples."""
         def stop(*_: Any) -> None:
             self._stop, waiting, self._waiting = True, self._waiting, False
             if waiting and self.world == 1:  # several processes stop together, after the same step
@@ -307,7 +309,7 @@ class Run:
 
     @contextmanager
     def _interruptible(self) -> Iterator[None]:
-        """While samples are waited for, which changes nothing of the run."""
+        """A signal in here ends the run at once. This is for waiting for samples, which does not change the run."""
         self._waiting = True
         try:
             yield
@@ -317,7 +319,7 @@ class Run:
     # Validation and files
 
     def _validate(self) -> None:
-        """Mean error on identities that training does not see, by rank 0; the best network so far is kept."""
+        """Measure the error on the validation samples, and save the network. Only the first process does this."""
         if self.rank:
             return
         objective = self.averaged.eval()

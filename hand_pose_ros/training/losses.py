@@ -1,5 +1,7 @@
-"""What training minimises. Every loss is a mean over the *whole* batch: samples that do not count add zero, so the
-mean over several processes is the loss of one process with all their samples.
+"""What training minimises.
+
+Every loss is a mean over the whole batch. Samples that do not count add zero. So the mean over several processes is the
+loss of one process with all their samples.
 """
 
 from __future__ import annotations
@@ -9,20 +11,23 @@ import torch.nn.functional as F
 from torch import Tensor
 
 Terms = dict[str, Tensor]
-"""Scalars by name; their sum is minimised."""
+"""Scalars by name. Their sum is minimised."""
 
 
 def joint_loss(kind: str, knee: float, joints: Tensor, truth: Tensor, counts: Tensor) -> Tensor:
     """Loss of the joints of a batch.
 
     Args:
-        kind: 'huber' of the distance of each joint, summed over the joints (paper; the sum is our reading: with
-            their mean the paper's learning rate hardly moves a network);
-            'squared', summed over all coordinates (original code: it regresses the coefficients of the prior, and the
-            two differ by a constant because the components are orthonormal and stay fixed);
-            'smooth_l1', mean over all coordinates.
-        knee: where huber and smooth_l1 go over from squared to linear, cube units.
-        joints: (B, J, 3); `truth` likewise, cube units.
+        kind: one of these.
+
+            - 'huber': Huber loss of the distance of each joint, summed over the joints (paper). The sum is our reading:
+              with the mean, the paper's learning rate hardly moves a network.
+            - 'squared': squared error, summed over all coordinates (original code). The original regresses the
+              coefficients of the prior instead. The two differ by a constant, because the components are orthonormal
+              and stay fixed.
+            - 'smooth_l1': mean over all coordinates.
+        knee: error in cube units from which huber and smooth_l1 grow linearly.
+        joints, truth: (B, J, 3) in cube units.
         counts: (B,) bool, the samples that count.
     """
     if kind == 'huber':

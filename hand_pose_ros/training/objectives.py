@@ -1,4 +1,4 @@
-"""What is trained, with what it is trained for: a module from a batch to the terms of its loss."""
+"""What each network is trained for. An objective is a module that maps a batch to the terms of the loss."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ class PoseObjective(nn.Module):
         super().__init__()
         self.network, self.recipe = network, recipe
         self.joints = list(range(len(skeleton)))
-        """Which of the skeleton are predicted."""
+        """Numbers of the joints of the skeleton that are predicted."""
 
     def forward(self, batch: Batch) -> Terms:
         joints, truth = self.predict(batch['patch']).float(), chosen(batch['joints'], self.joints)
         return {'joints': joint_loss(self.recipe.loss, self.recipe.knee, joints, truth, joints_count(batch))}
 
     def poses(self, batch: Batch) -> Tensor:
-        """What the network has to give for these samples, (B, J, 3): the prior is one of such poses."""
+        """The poses (B, J, 3) that the network has to predict for these samples. The prior is fitted to them."""
         return batch['joints']
 
     def predict(self, patch: Tensor) -> Tensor:
-        """(B, 1, 128, 128) -> joints (B, J, 3) in cube units, after training."""
+        """Patches (B, 1, 128, 128) -> joints (B, J, 3) in cube units."""
         return self.network(patch)
 
 
 class CenterObjective(PoseObjective):
-    """A network that says where in the cube the palm is (DeepPrior++), to centre the cube there."""
+    """A network that predicts where the palm is in the cube, to centre the cube there (DeepPrior++)."""
 
     PALMS = ('palm', 'middle_mcp')
 
@@ -54,21 +54,21 @@ class CenterObjective(PoseObjective):
 
 
 _WEIGHTS = {'maps': 1.0, 'confidence': 0.01, 'hand': 0.01, 'side': 0.01, 'size': 0.01}
-"""Of the terms of a dense network; the joints have 1. The small ones are not to bend the features."""
+"""Weights of the terms of a dense network; the joints have 1. Small terms must not decide what the features are."""
 
 
 class DenseObjective(PoseObjective):
-    """A network with maps of votes for the joints, and with what a tracker needs to know beside them.
+    """A network with maps of votes for the joints, and with what a tracker needs. Beside the joints, it is trained for:
 
-    - the votes themselves, not only what they add up to: every cell that sees something learns from every sample
-    - confidence: is the joint within 20 mm?
-    - hand: does the patch show one? side: is it shown the right way round?
-    - size: logarithm of the hand's length over TOLD_SIZE, 0.19 m in a cube of 0.30 m: the network sees the hand in its
-      cube and nothing else
+    - maps: the votes of each cell, not only their sum. So all cells that see something learn from each sample.
+    - confidence: whether a joint is within CONFIDENT of the truth.
+    - hand: whether the patch shows a hand.
+    - side: whether the hand is not mirrored.
+    - size: see `HandDense.forward_full`. The network sees the hand relative to its cube, so the size is, too.
     """
 
     CONFIDENT = 0.020
-    """Metres."""
+    """In metres."""
 
     def __init__(self, network: nn.Module, recipe: Recipe, skeleton: Skeleton) -> None:
         super().__init__(network, recipe, skeleton)
@@ -79,8 +79,12 @@ class DenseObjective(PoseObjective):
         return self._terms(out, batch, batch['joints'], batch['joints'].new_ones(()))
 
     def _terms(self, out: dict[str, Tensor], batch: Batch, truth: Tensor, scale: Tensor) -> Terms:
-        """The loss of an answer to a batch whose joints (B, J, 3) are in units of the cube, or of one that
-        is smaller by this factor (B,)."""
+        """The terms of the loss of the answer to a batch.
+
+        Args:
+            truth: joints (B, J, 3) in the units of the answer.
+            scale: one such unit in cube units, (B,) or (). A view of the second look has its own units.
+        """
         counts, half = joints_count(batch), batch['cube_side'] / 2 * scale
         joints, refined = out['joints'].float(), out['unrefined'] is not out['joints']
         directions, closeness = encode(out['positions'], truth)
@@ -104,7 +108,7 @@ class DenseObjective(PoseObjective):
                 **{name: _WEIGHTS[name] * value.mean() for name, value in extra.items()}}
 
     def _size(self, batch: Batch) -> Tensor:
-        """The logarithm (B,) of the hands' length over the usual one of their cubes; 0 where joints do not tell it."""
+        """The size of the hands (B,), see `HandDense.forward_full`. 0 if the skeleton has no wrist."""
         if self.middle_finger is None:
             return torch.zeros_like(batch['cube_side'])
         cube = batch['cube_center'], batch['cube_side']
@@ -113,7 +117,7 @@ class DenseObjective(PoseObjective):
 
 
 class SecondLookObjective(DenseObjective):
-    """The second of two looks, at the hand as the first one finds it: the errors it makes in use, it makes here."""
+    """The second of two looks. It sees the hand as the first look finds it, with the same errors as in use."""
 
     network: TwoLooks
 
@@ -129,19 +133,19 @@ class SecondLookObjective(DenseObjective):
 class FinderObjective(PoseObjective):
     """A network that finds the middles of hands in whole images (Zhou et al. 2019, Objects as Points).
 
-    Cells within about SPREAD of a middle are to say so, the closer the surer (quality focal loss, Li et al. 2020:
-    the easy ones do not count), and to tell where it is. Every other image is shown in the mirror; some readings are
-    lost.
+    The target of the score of a cell is 1 at a middle, and falls with the distance. The loss is the quality focal loss
+    (Li et al. 2020), for which easy cells hardly count. Cells near a middle are also trained to predict where it is.
+    Every other image is mirrored, and some readings are lost.
     """
 
     SPREAD = 0.035
-    """Metres."""
+    """Standard deviation of the target around a middle, in metres."""
     DROPOUT = 0.2
-    """Share of readings that are lost: up to this."""
+    """Maximum share of readings of an image that are lost."""
 
     def __init__(self, network: nn.Module, recipe: Recipe, skeleton: Skeleton) -> None:
         super().__init__(network, recipe, skeleton)
-        self.joints = [0]  # in validation: the middle of the first hand
+        self.joints = [0]  # validation compares with the middle of the first hand
 
     def forward(self, batch: Batch) -> Terms:
         depth, truth = batch['patch'], batch['joints']
@@ -164,7 +168,7 @@ class FinderObjective(PoseObjective):
         mine = truth[torch.arange(len(truth), device=truth.device)[:, None, None], whose].permute(0, 3, 1, 2)
         off = (middles - mine) * torch.cat([(1 + mine[:, 2:]).expand(-1, 2, -1, -1), torch.ones_like(mine[:, 2:])], 1)
         place = F.smooth_l1_loss(off, torch.zeros_like(off), reduction='none', beta=0.01).sum(1)
-        # Per image, of which there are as many in every process; an image has about one hand.
+        # Per image, because all processes have the same number of images. An image has about one hand.
         return {'score': score.sum() / len(depth), 'place': 2 * (place * target * (target > 0.2)).sum() / len(depth)}
 
     def predict(self, patch: Tensor) -> Tensor:
@@ -175,22 +179,22 @@ class FinderObjective(PoseObjective):
 
 
 class RefinerObjective(nn.Module):
-    """A refiner over a first stage that stays as it is.
+    """A refiner of the joints of a base network. The base is not trained.
 
-    It must learn from errors as the first stage makes them on *new* data, so its samples are ones that the first
-    stage was not trained on. Jitter on top of the estimates shows it the errors between those that happen to occur;
-    the second iteration starts where the first one left off, as in use.
+    The refiner must learn from errors that the base makes on new data. So the base was not trained on its samples.
+    Jitter is added to the estimates of the base, so that the refiner also sees errors that did not occur. As in use,
+    the second iteration starts from the result of the first.
     """
 
     ITERATIONS = 2
     JITTER = 0.03
-    """Standard deviation, cube units (4.5 mm in a cube of 0.3 m)."""
+    """Standard deviation in cube units (4.5 mm in a cube of 0.3 m)."""
 
     def __init__(self, refiner: nn.Module, base: nn.Module, recipe: Recipe, skeleton: Skeleton) -> None:
         super().__init__()
         self.refiner, self.recipe = refiner, recipe
         self.joints = list(range(len(skeleton)))
-        self._base = [base.eval().requires_grad_(False)]  # in a list: no part of what is trained, saved or averaged
+        self._base = [base.eval().requires_grad_(False)]  # a list, so that it is not trained, saved or averaged
 
     def forward(self, batch: Batch) -> Terms:
         estimate = self._estimate(batch['patch'])
@@ -213,21 +217,21 @@ class RefinerObjective(nn.Module):
 OBJECTIVES: dict[str, type[PoseObjective]] = {
     'hand_dense': DenseObjective, 'two_looks': SecondLookObjective, 'center_refiner': CenterObjective,
     'hand_finder': FinderObjective}
-"""By architecture, of those that are to do something else than to predict joints."""
+"""By architecture. All other architectures have a `PoseObjective`."""
 
 
 def objective_for(network: nn.Module, recipe: Recipe, skeleton: Skeleton) -> PoseObjective:
-    """What a network, made by `models.build`, is trained for."""
+    """The objective of a network that `models.build` made."""
     return OBJECTIVES.get(str(vars(network)['architecture']), PoseObjective)(network, recipe, skeleton)
 
 
 def chosen(joints: Tensor, which: list[int]) -> Tensor:
-    """Some of the joints (B, J, 3); a list as an index would be copied to a GPU, which a CUDA graph cannot hold."""
+    """Some of the joints (B, J, 3). A list as an index would be copied to the GPU, which a CUDA graph cannot hold."""
     return torch.stack([joints[:, joint] for joint in which], dim=1)
 
 
 def joints_count(batch: Batch) -> Tensor:
-    """The samples whose joints count: with a hand, and shown with the right side."""
+    """The samples whose joints count, (B,) bool. They show a hand, and are not mirrored."""
     return batch['hand_present'] & ~batch['mirrored']
 
 

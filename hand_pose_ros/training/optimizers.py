@@ -15,7 +15,7 @@ from hand_pose_ros.training.recipes import Recipe
 
 
 class FlooredRMSProp(Optimizer):
-    """RMSProp of the original code: decay 0.9, and the root mean square floored at 0.01, with nothing added."""
+    """RMSProp of the original code. The decay is 0.9, and the root mean square is at least 0.01."""
 
     def __init__(self, params: Any, lr: float) -> None:
         super().__init__(params, {'lr': lr})
@@ -34,36 +34,37 @@ class FlooredRMSProp(Optimizer):
 
 
 class Muon(torch.optim.AdamW):
-    """AdamW, but that the weights of convolutions take steps that are orthogonal matrices (Jordan et al. 2024, Muon).
+    """Muon (Jordan et al. 2024) for the weights of convolutions, and AdamW for all other parameters.
 
-    Such a step moves all directions of a weight equally far, not only those that most gradients share.
+    The steps of Muon are orthogonal matrices. Such a step moves all directions of a weight equally far, not only those
+    that most gradients share.
     """
 
     MOMENTUM = 0.95
     STEP = 0.8
-    """Root mean square of a step at a learning rate of 1. With 0.2 it is as large as one of AdamW usually is (Liu et
-    al. 2025, Muon is Scalable for LLM Training); our small networks want four times that."""
+    """Root mean square of a step at a learning rate of 1. With 0.2, steps are usually as large as those of AdamW (Liu
+    et al. 2025, Muon is Scalable for LLM Training). Our small networks need four times as much."""
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> None:  # type: ignore[override]
         for group in self.param_groups:
-            alike: dict[tuple[int, ...], list[Tensor]] = {}  # a GPU does all weights of one shape at once
+            alike: dict[tuple[int, ...], list[Tensor]] = {}  # weights of one shape are computed together
             for parameter in group['params']:
                 if parameter.ndim == 4 and parameter.grad is not None:
                     alike.setdefault(tuple(parameter.flatten(1).shape), []).append(parameter)
             for shape, parameters in alike.items():
-                size = self.STEP * group['lr'] * max(shape) ** 0.5  # of an orthogonal matrix every entry is small
+                size = self.STEP * group['lr'] * max(shape) ** 0.5  # the entries of an orthogonal matrix are small
                 steps = torch.stack([self._nesterov(parameter).flatten(1) for parameter in parameters])
                 for parameter, step in zip(parameters, orthogonal(steps), strict=True):
                     parameter.mul_(1 - group['lr'] * group['weight_decay'])
                     parameter.add_(step.view_as(parameter), alpha=-size)
-                    parameter.grad = None  # the rest is for AdamW
+                    parameter.grad = None  # so that AdamW leaves this parameter alone
         super().step()
 
     def _nesterov(self, parameter: Tensor) -> Tensor:
         state = self.state[parameter]
         if not state:
-            # AdamW looks for a step in every state that it reads.
+            # AdamW expects a step in every state.
             state.update(step=torch.zeros(()), momentum=torch.zeros_like(parameter))
         assert parameter.grad is not None
         state['momentum'].lerp_(parameter.grad, 1 - self.MOMENTUM)
@@ -71,11 +72,11 @@ class Muon(torch.optim.AdamW):
 
 
 def orthogonal(matrices: Tensor) -> Tensor:
-    """About the nearest to each of these matrices (N, A, B) whose singular values are all 1: most come out between 0.68
-    and 1.14, those that were hundreds of times smaller than the largest below.
+    """Matrices (N, A, B) -> approximately the nearest matrices whose singular values are all 1.
 
-    Five Newton-Schulz steps (Jordan et al. 2024). All are polynomials of one small symmetric matrix, so they are
-    worked out there and applied once, in a third of the time.
+    Most singular values become 0.68 to 1.14. Those that were hundreds of times smaller than the largest become less.
+    There are five Newton-Schulz steps (Jordan et al. 2024). All are polynomials of one small symmetric matrix. So they
+    are computed on this matrix and applied once, which takes a third of the time.
     """
     a, b, c = 3.4445, -4.7750, 2.0315
     wide = matrices.shape[1] <= matrices.shape[2]
@@ -92,10 +93,10 @@ def orthogonal(matrices: Tensor) -> Tensor:
 
 
 def make_optimizer(recipe: Recipe, network: nn.Module) -> Optimizer:
-    """The optimiser of a recipe for all parameters that want gradients; biases and norms are not decayed.
+    """The optimiser of a recipe, for all parameters that require gradients. Biases and norms have no weight decay.
 
     Raises:
-        HandPoseError: one that cannot do what the recipe says.
+        HandPoseError: the optimiser cannot do what the recipe says.
     """
     wanted = {name: p for name, p in network.named_parameters() if p.requires_grad}
     decayed = {name for name, p in wanted.items() if p.ndim > 1 and 'bias' not in name}
@@ -105,7 +106,7 @@ def make_optimizer(recipe: Recipe, network: nn.Module) -> Optimizer:
         return torch.optim.SGD(groups, lr=recipe.learning_rate, momentum=recipe.momentum)
     if recipe.optimizer == 'rmsprop':
         if recipe.momentum or recipe.weight_decay:
-            raise HandPoseError('rmsprop is that of the original code, without momentum and weight decay: '
+            raise HandPoseError('rmsprop has no momentum and no weight decay, as in the original code: give '
                                 '--set momentum=0 --set weight_decay=0')
         return FlooredRMSProp(list(wanted.values()), lr=recipe.learning_rate)
     if recipe.optimizer == 'adamw':
@@ -114,10 +115,11 @@ def make_optimizer(recipe: Recipe, network: nn.Module) -> Optimizer:
 
 
 def learning_rate(recipe: Recipe, progress: float) -> float:
-    """The learning rate after this share of the budget, in [0, 1].
+    """The learning rate after a share of the budget (`progress`, in [0, 1]).
 
-    'constant'; 'hyperbolic', in steps by epoch, rate / (1 + 0.2 epoch) with the first epoch 1 (original code);
-    'cosine', down to 0.
+    - 'constant': always the same.
+    - 'hyperbolic': rate / (1 + 0.2 * epoch), where the first epoch is 1 (original code).
+    - 'cosine': falls to 0.
     """
     rate = recipe.learning_rate * (min(1.0, progress / recipe.warmup) if recipe.warmup else 1.0)
     if recipe.schedule == 'constant':

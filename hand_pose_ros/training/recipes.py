@@ -1,4 +1,4 @@
-"""What is trained on what, and how: one dataclass, four named recipes, any value replaceable on the command line."""
+"""What is trained, on what, and how. There are four named recipes. The command line can replace every value."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ from hand_pose_ros.models.checkpoints import available
 from hand_pose_ros.training.augmentation import PRESETS, Augmentation
 
 MAX_SEED = 1 << 22
-"""Seeds and the numbers of samples share the 63 bits of a key."""
+"""A key of 63 bits holds both the seed and the number of a sample."""
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """All that decides the result of a training run; the machine (device, processes, folders) does not.
+    """Everything that decides the result of a training run. The machine (device, processes, folders) does not.
 
     Raises:
-        HandPoseError: there is no such loss, optimiser, schedule or precision.
+        HandPoseError: the loss, optimiser, schedule or precision does not exist.
     """
 
     # Network
     network: str = 'deep'
     """A name of `hand_pose_ros.models.ARCHITECTURES`."""
     options: dict[str, Any] = field(default_factory=lambda: {'bottleneck': 30})
-    """What the network takes, for example options.bottleneck=8, options.bottleneck=none (direct), options.width=48; or
-    what the refiner takes, for example options.dropout=0."""
+    """Arguments of the network, for example options.bottleneck=8, options.bottleneck=none (no prior), options.width=48;
+    or of the refiner, for example options.dropout=0."""
     train_prior: bool = True
-    """Train the reconstruction layer on after it was set to the principal components."""
+    """Whether the reconstruction is trained after it was set to the principal components."""
     refiner: str | None = None
-    """Train this refiner (std_ref or or_ref) on the estimates of `base`, whose weights stay as they are."""
+    """Train this refiner (std_ref or or_ref) on the estimates of `base`. The base is not trained."""
     base: str | None = None
     """Checkpoint that the refiner corrects, or that a network starts from."""
     first: str | None = None
-    """Checkpoint of a hand_dense, which is the first of two_looks and stays as it is."""
+    """Checkpoint of a hand_dense. It is the first look of two_looks, and is not trained."""
 
     # Data
     dataset: str = 'synthetic'
@@ -47,45 +47,44 @@ class Recipe:
     """Folder of a recorded dataset."""
     shard_size: int = 2048
     reuse: int = 4
-    """How often a rendered sample is used, augmented anew each time."""
+    """How often a rendered sample is used. It is augmented differently each time."""
     first_shard: int = 0
-    """Leave out what is before; a refiner on endless data starts behind what its base has seen by itself."""
+    """Shards before this one are left out. A refiner always starts after the shards that its base has seen."""
     last_shard: int | None = None
-    """Leave out what is from here on (recorded datasets)."""
+    """Shards from this one on are left out (recorded datasets only)."""
     augmentation: Augmentation = PRESETS['none']
 
     # Optimisation
     loss: str = 'huber'
-    """Of the joints: 'huber', 'smooth_l1' or 'squared', see `losses.joint_loss`."""
+    """Loss of the joints: 'huber', 'smooth_l1' or 'squared', see `losses.joint_loss`."""
     knee: float = 0.1
-    """Error in cube units (0.1 is 15 mm in a cube of 0.3 m) from which a loss grows linearly; 'squared' has none."""
+    """Error in cube units from which the loss grows linearly (0.1 is 15 mm in a cube of 0.3 m). 'squared' has none."""
     optimizer: str = 'sgd'
     """'sgd', 'rmsprop', 'adamw' or 'muon'."""
     learning_rate: float = 0.01
     schedule: str = 'constant'
-    """Of the learning rate: 'constant', 'hyperbolic' or 'cosine'."""
+    """How the learning rate falls: 'constant', 'hyperbolic' or 'cosine', see `optimizers.learning_rate`."""
     warmup: float = 0.0
-    """Share of the budget in which the learning rate rises linearly from 0."""
+    """Share of the budget during which the learning rate rises linearly from 0."""
     momentum: float = 0.9
     weight_decay: float = 0.001
     batch_size: int = 128
     epochs: int = 100
     samples: int | None = None
-    """Budget in samples seen; None = `epochs` passes. Endless data have no passes: an epoch is then 72,757 samples,
-    as many as the NYU training set has, or, with a budget, its `epochs`-th part."""
+    """Budget: the number of samples that are seen. None = `epochs` epochs. In endless data, an epoch is 72,757 samples,
+    as many as the NYU training set has. With a budget, an epoch is the budget divided by `epochs`."""
     precision: str = 'float32'
-    """'float32', or 'bfloat16' for the convolutions and matrix products of the forward and backward pass: about one and
-    a half times as fast on a CPU that has the instructions (avx512_bf16, amx)."""
+    """'float32', or 'bfloat16' for convolutions and matrix products. This is about 1.5 times as fast on a CPU with the
+    instructions (avx512_bf16, amx)."""
     average: float = 0.0
-    """Decay per step of the average of the weights that is validated and shipped; 0 = the weights themselves."""
+    """The average of the weights is validated and saved. This is its decay per step; 0 = the weights themselves."""
     seed: int = 23455
 
     # Validation
     val_samples: int = 2048
-    """At most; of a recorded dataset they are spread over all that validates."""
+    """Maximum number of samples. In a recorded dataset, they are spread over the whole split."""
     val_every: int = 65_536
-    """Samples between two validations."""
-
+    """Number of training samples between two validations."""
 
     def __post_init__(self) -> None:
         for name, choices in _CHOICES.items():
@@ -94,6 +93,7 @@ class Recipe:
 
 
 EPOCH_OF_ENDLESS_DATA = 72_757
+"""Number of samples, see `Recipe.samples`."""
 
 _CHOICES = {'loss': ('huber', 'smooth_l1', 'squared'), 'optimizer': ('sgd', 'rmsprop', 'adamw', 'muon'),
             'schedule': ('constant', 'hyperbolic', 'cosine'), 'precision': ('float32', 'bfloat16')}
@@ -104,21 +104,20 @@ _RANGES: dict[str, tuple[float, float]] = {
     **dict.fromkeys(('first_shard', 'last_shard', 'weight_decay'), (0, math.inf)),
     **dict.fromkeys(('warmup', 'momentum', 'average', 'jitter_tail', 'dropout', 'erase', 'mirror'), (0, 1)),
 }
-"""What a number of a recipe or its augmentation may be; where nothing is said, at least 1."""
+"""Least and greatest value of a number of a recipe or its augmentation. All others must be at least 1."""
 
 RECIPES = {
-    # The paper, section 4.1. It gives neither the knee of its Huber loss nor a schedule: those are ours.
+    # The paper, section 4.1. It gives neither the knee of the Huber loss nor a schedule. Ours are used.
     'paper': Recipe(),
-    # What the released code does: it never trains the prior's layer, and weight decay is inactive under dropout.
+    # What the released code does. It never trains the reconstruction, and has no weight decay if there is dropout.
     'original-code': Recipe(train_prior=False, loss='squared', optimizer='rmsprop', schedule='hyperbolic',
                             momentum=0.0, weight_decay=0.0),
-    # A dense network (reference: AWR, A2J), every sample augmented, a loss that never stops caring about millimetres,
-    # Muon with cosine decay, which needs half the samples of AdamW (docs/training.md), and averaged weights, worth a
-    # step of the decay.
+    # A dense network (as AWR, A2J), augmentation of every sample, a loss for which a millimetre always counts, Muon,
+    # which needs half the samples of AdamW (docs/training.md), and averaged weights.
     'modern': Recipe(network='hand_dense', augmentation=PRESETS['modern'], loss='smooth_l1', knee=0.01,
                      optimizer='muon', learning_rate=2e-3, schedule='cosine', warmup=0.02, weight_decay=0.01,
                      batch_size=64, samples=2_000_000, precision='bfloat16', average=0.998),
-    # The same for what finds hands in whole images; its objective has its own augmentation.
+    # For the network that finds hands in whole images. Its objective has its own augmentation.
     'finder': Recipe(network='hand_finder', options={}, dataset='scenes', reuse=10, optimizer='adamw',
                      learning_rate=2e-3, schedule='cosine', warmup=0.02, weight_decay=0.01, batch_size=32,
                      samples=400_000, precision='bfloat16', average=0.998),
@@ -131,11 +130,11 @@ def get_recipe(name: str, overrides: Iterable[str] = ()) -> Recipe:
     """A named recipe with values replaced.
 
     Args:
-        overrides: 'key=value' with a key of `Recipe`, dotted for the values inside one: 'learning_rate=0.003',
+        overrides: 'key=value' with a key of `Recipe`, or with dots for a value inside: 'learning_rate=0.003',
             'options.bottleneck=8', 'augmentation.jitter=0.01', 'augmentation=modern', 'base=none'.
 
     Raises:
-        HandPoseError: no such recipe or key, or a value of the wrong kind or out of range.
+        HandPoseError: the recipe or a key does not exist, or a value is of the wrong type or out of range.
     """
     if name not in RECIPES:
         raise HandPoseError(f"unknown recipe '{name}': choose one of {', '.join(RECIPES)}")
@@ -145,13 +144,13 @@ def get_recipe(name: str, overrides: Iterable[str] = ()) -> Recipe:
         if not equals:
             raise HandPoseError(f'--set {item}: write it as key=value')
         recipe = _replace(recipe, key.split('.'), text, item)
-    # So that the run can go on from another folder.
+    # So that the run can be resumed from another folder.
     return dataclasses.replace(recipe, base=_absolute(recipe.base), first=_absolute(recipe.first),
                                root=_absolute(recipe.root))
 
 
 def _absolute(path: str | None) -> str | None:
-    """The same file or folder wherever one is; a name of weights that ship stays one."""
+    """An absolute path, if there is such a file or folder. The names of weights that ship stay as they are."""
     if path is None or path in available() or not (there := Path(path).expanduser()).exists():
         return path
     return str(there.resolve())

@@ -1,4 +1,4 @@
-"""What a recipe trains, and what that starts from: fresh weights, those of other networks, the pose prior."""
+"""The network that a recipe trains, and what it starts from: fresh weights, those of other networks, the pose prior."""
 
 from __future__ import annotations
 
@@ -26,23 +26,26 @@ log = logging.getLogger(__name__)
 
 
 def first_shard(recipe: Recipe, base: Checkpoint | None, data: Dataset) -> int:
-    """Where the samples of a run begin: a refiner starts behind what its base was trained on.
+    """The first shard of a run. A refiner starts after the shards on which its base was trained.
 
     Raises:
-        TrainingError: the base was trained on everything.
+        TrainingError: the base of a refiner was trained on the whole dataset.
     """
     first = recipe.first_shard
     if recipe.refiner and (seen := shards_seen(recipe, base, data)):
         first = max(first, seen)
         if data.size is not None and first * recipe.shard_size >= data.size:
-            raise TrainingError(f'{recipe.base} was trained on all of {data.name}, so a refiner would learn '
-                                'from estimates that are better than in use: train the base with --set '
-                                'last_shard=N, which leaves the shards from N on to the refiner')
+            raise TrainingError(f'{recipe.base} was trained on all of {data.name}, so its estimates there are better '
+                                'than those that a refiner sees in use: train the base with --set last_shard=N, which '
+                                'leaves the shards from N on to the refiner')
     return first
 
 
 def shards_seen(recipe: Recipe, base: Checkpoint | None, data: Dataset) -> int:
-    """One past the last shard, as large as the recipe says, that a base and what that started from were trained on."""
+    """The number of the first shard that a base, and the networks that it started from, have not seen.
+
+    Shards are as large as the recipe says.
+    """
     if base is None or base.metadata.get('training_data') != data.name:
         return 0
     of = base.metadata.get('recipe', {})
@@ -54,26 +57,27 @@ def shards_seen(recipe: Recipe, base: Checkpoint | None, data: Dataset) -> int:
 
 def make_objective(recipe: Recipe, base: Checkpoint | None, shards: DiskShards | MemoryShards,
                    window: range) -> PoseObjective | RefinerObjective:
-    """The network of a recipe with its loss, as it is before the first step.
+    """The network of a recipe and its loss, before the first step.
 
     Args:
-        base: what `recipe.base` names.
+        base: the checkpoint that `recipe.base` names.
         shards: the training samples.
-        window: those that the first steps show, to which the pose prior is fitted: of a recorded dataset all.
+        window: numbers of the shards to which the pose prior is fitted. These are the shards of the first steps. In a
+            recorded dataset, they are all shards.
 
     Raises:
-        TrainingError: parts of the recipe, or its base, do not go together.
+        TrainingError: the parts of the recipe, or its base, do not fit each other.
     """
     skeleton = shards.dataset.skeleton
-    if base and base.metadata['skeleton'] != skeleton.name and recipe.network != 'center_refiner':  # a palm is a palm
+    if base and base.metadata['skeleton'] != skeleton.name and recipe.network != 'center_refiner':  # all have a palm
         raise TrainingError(f'{recipe.base} gives joints of {base.metadata["skeleton"]}, but {recipe.dataset} has '
-                            f'those of {skeleton.name}: choose a base of the same')
+                            f'those of {skeleton.name}: choose a base with the same joints')
     if recipe.refiner:
         return _refiner_objective(recipe, base, skeleton)
     network = _make_network(recipe, base, skeleton)
     objective = objective_for(network, recipe, skeleton)
     has_prior = base is not None and _start_from(network, base, recipe)
-    bottleneck = vars(network)['config'].get('bottleneck')  # which some have without being asked
+    bottleneck = vars(network)['config'].get('bottleneck')  # some architectures have one by default
     if bottleneck and not has_prior:
         prior = fit_prior(_training_poses(objective, shards, window, recipe), bottleneck)
         network.set_prior(prior.mean, prior.components)  # type: ignore[operator]
@@ -90,21 +94,21 @@ def _refiner_objective(recipe: Recipe, base: Checkpoint | None, skeleton: Skelet
         raise TrainingError(f'--set refiner={recipe.refiner}: choose one of {", ".join(REFINERS)}')
     if (first := vars(base.network)['architecture']) in NO_JOINTS:
         raise TrainingError(f'{recipe.base} is a {first}, which gives no joints to correct: choose another base')
-    options = {name: value for name, value in recipe.options.items() if name != 'bottleneck'}  # which no refiner has
+    options = {name: value for name, value in recipe.options.items() if name != 'bottleneck'}  # a refiner has none
     refiner = build(recipe.refiner, **options | {'joints': len(skeleton)})
     return RefinerObjective(refiner, base.network, recipe, skeleton)
 
 
 def _make_network(recipe: Recipe, base: Checkpoint | None, skeleton: Skeleton) -> nn.Module:
-    """With fresh weights, but for the first of two looks."""
+    """The network of a recipe, with fresh weights. The first of two looks has those of its checkpoint."""
     if recipe.first and recipe.network != 'two_looks':
         raise TrainingError(f'--set first=FILE is for --set network=two_looks, and {recipe.network} has one look')
     if recipe.network in REFINERS:
         raise TrainingError(f'{recipe.network} corrects the joints of another network: train it with '
                             f'--set refiner={recipe.network} --set base=FILE, and leave out --set network')
     if (recipe.network == 'hand_finder') != (recipe.dataset == 'scenes'):
-        raise TrainingError(f'{recipe.network} cannot learn from {recipe.dataset}: hand_finder, and nothing else, '
-                            'is trained with dataset=scenes')
+        raise TrainingError(f'{recipe.network} cannot learn from {recipe.dataset}: only hand_finder is trained with '
+                            'dataset=scenes, and it needs this dataset')
     if recipe.network == 'hand_finder' and recipe.augmentation != PRESETS['none']:
         raise TrainingError('hand_finder has its own augmentation: leave out --set augmentation')
     given: dict[str, Any] = {}
@@ -116,7 +120,7 @@ def _make_network(recipe: Recipe, base: Checkpoint | None, skeleton: Skeleton) -
         given |= {'root': skeleton.root, 'knuckles': skeleton.knuckles,
                   'first': {key: getattr(first, key) for key in ('width', 'bottleneck', 'blocks', 'refined')}}
     if taken := sorted(given.keys() & recipe.options.keys()):
-        raise TrainingError(f'--set options.{taken[0]}: this follows from the dataset; leave it out')
+        raise TrainingError(f'--set options.{taken[0]}: this follows from the dataset or the first look: leave it out')
     network = build(recipe.network, **given, **recipe.options)
     if first is not None:
         network.first.load_state_dict(first.state_dict())  # type: ignore[union-attr]
@@ -124,23 +128,26 @@ def _make_network(recipe: Recipe, base: Checkpoint | None, skeleton: Skeleton) -
 
 
 def _first_look(recipe: Recipe, base: Checkpoint | None, skeleton: Skeleton) -> HandDense:
-    """The network that tells the second look where to look."""
+    """The first of two looks. It is that of `recipe.first`, or else that of a base with two looks."""
     of = load_checkpoint(recipe.first) if recipe.first else None
     if of is None and base is not None and isinstance(base.network, TwoLooks):
         of = base
     first = of.network if of else None
     first = first.first if isinstance(first, TwoLooks) else first
     if of is None or not isinstance(first, HandDense) or of.metadata['skeleton'] != skeleton.name:
-        raise TrainingError(f'two_looks of {skeleton.name} need a hand_dense of these joints as the first: '
+        raise TrainingError(f'two_looks needs a hand_dense with the joints of {skeleton.name} as its first look: '
                             '--set first=FILE')
     return first
 
 
 def _start_from(network: nn.Module, base: Checkpoint, recipe: Recipe) -> bool:
-    """Take the weights of the base; False if it has none for the prior.
+    """Copy the weights of the base into the network. Returns False if only the network has a pose prior.
 
-    That it may lack, and what starts as the identity: further blocks of a stage, and the refinement. The second
-    of two looks may start as any hand_dense, but that its prior is another.
+    The base may lack the prior, and all parts that start as the identity (further blocks of a stage, and the
+    refinement). The second of two looks may start from any hand_dense, but not from its prior.
+
+    Raises:
+        TrainingError: the base is another network.
     """
     own = base.network.state_dict()
     if isinstance(network, TwoLooks):
@@ -161,7 +168,7 @@ def _start_from(network: nn.Module, base: Checkpoint, recipe: Recipe) -> bool:
 
 def _training_poses(objective: PoseObjective, shards: DiskShards | MemoryShards, window: range,
                     recipe: Recipe) -> Tensor:
-    """Poses as the network will meet them; a few are augmented in several ways, which is plenty for a covariance."""
+    """Augmented poses of the window, (N, J, 3). If there are few, each is augmented in several ways."""
     shards.keep(window)
     parts = [{key: value.cpu() for key, value in shards.read(shard).items() if key != 'patch'} for shard in window]
     samples = {key: torch.cat([part[key] for part in parts]) for key in parts[0]}

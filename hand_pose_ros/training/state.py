@@ -1,4 +1,4 @@
-"""Everything that a run needs to go on as if it had never stopped: one safetensors file, written in one step."""
+"""Everything that a run needs to go on as if it had never stopped, in one safetensors file."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ from hand_pose_ros.files import in_one_step
 
 
 def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, Any]) -> None:
-    """Write tensors and a JSON dictionary to one file that appears only when it is complete."""
+    """Write tensors and a dictionary for JSON to one safetensors file, in one step."""
     with in_one_step(path) as part:
         save_file({key: value.detach().cpu().contiguous() for key, value in tensors.items()}, part,
                   metadata={'json': json.dumps(metadata)})
 
 
 def save_state(path: Path, modules: dict[str, nn.Module], optimizer: Optimizer, progress: dict[str, Any]) -> None:
-    """Write modules, the state of the optimiser and plain values (step, best result)."""
+    """Write the modules, the state of the optimiser, and plain values that JSON can hold (step, best result)."""
     tensors = {f'{name}.{key}': value for name, module in modules.items() for key, value in module.state_dict().items()}
     for index, values in optimizer.state_dict()['state'].items():
         tensors |= {f'optimizer.{index}.{key}': torch.as_tensor(value) for key, value in values.items()}
-    # A clone each: safetensors refuses tensors that share memory, as the averaged network's and the network's might.
+    # safetensors refuses tensors that share memory, as those of the network and its average might. So each is cloned.
     save_tensors(path, {key: value.clone() for key, value in tensors.items()}, progress)
 
 
 def load_progress(path: Path) -> dict[str, Any]:
-    """The plain values alone, of a file that exists and is whole."""
+    """Only the plain values. The file must exist and be whole."""
     with safe_open(path, 'pt') as file:
         return json.loads(file.metadata()['json'])
 
 
 def load_state(path: Path, modules: dict[str, nn.Module], optimizer: Optimizer) -> dict[str, Any]:
-    """Read back into the same modules and optimiser; returns the plain values.
+    """Read the state of the modules and the optimiser. Returns the plain values.
 
     Raises:
-        CheckpointError: no such file, it is damaged, or belongs to another network.
+        CheckpointError: the file is missing or damaged, or belongs to another network.
     """
     try:
         with safe_open(path, 'pt') as file:

@@ -1,4 +1,4 @@
-"""Which samples a training step sees: a pure function of (seed, step), so that a resumed run continues bit for bit."""
+"""Which samples a training step sees. They depend only on the seed and the step, so a resumed run is the same."""
 
 from __future__ import annotations
 
@@ -13,17 +13,20 @@ from hand_pose_ros.datasets.shards import DiskShards, MemoryShards
 
 
 class SampleStream:
-    """Samples in *stages*. A stage shows, in random order, every sample of a window of shards once.
+    """Samples in stages. A stage shows every sample of a window of shards once, in random order.
 
-    - Of a finite dataset the window is all of it, so a stage is an epoch.
-    - Of an endless one the window slides: stage s shows the `reuse` shards up to s, so every sample is used `reuse`
-      times (each time augmented differently) while the shards of later stages are being rendered. Training needs
-      a new sample only for every `reuse` that it consumes, and starts as soon as the first shard is there.
+    - In a finite dataset, the window is the whole dataset. So a stage is an epoch.
+    - In an endless dataset, the window slides. Stage s shows the `reuse` shards up to the s-th, while later shards are
+      rendered. So each sample is used `reuse` times, and is augmented differently each time. Training starts as soon
+      as the first shard is there.
 
     Args:
-        first: shards before this one are left out; what a refiner sees, its first stage must not have seen.
+        first: shards before this one are left out.
         last: shards from this one on are left out (finite datasets only).
-        part: (rank, world size): this process takes its equal part of every batch.
+        part: (rank, world size). This process takes its equal part of every batch.
+
+    Raises:
+        DatasetError: no shard is left.
     """
 
     def __init__(self, shards: DiskShards | MemoryShards, batch_size: int, seed: int, reuse: int = 1,
@@ -33,7 +36,7 @@ class SampleStream:
         size, n = shards.dataset.size, shards.shard_size
         self._window: range | None = None
         self.epoch_size: int | None = None
-        """Samples in a pass over a finite dataset."""
+        """Number of samples in a pass over a finite dataset; None = endless."""
         if size is not None:
             self._window = range(first, min(-(-size // n), last if last is not None else size))
             self.epoch_size = min(self._window.stop * n, size) - first * n
@@ -43,7 +46,7 @@ class SampleStream:
         self._stage: tuple[int, NDArray[np.int64]] | None = None
 
     def batch(self, step: int) -> tuple[Batch, torch.Tensor]:
-        """The samples of a step (patches as float32), and for each its number (B,) in the order of consumption."""
+        """The samples of a step, with patches as float32, and their numbers (B,) in the order of use."""
         rank, world = self.part
         share = self.batch_size // world
         start = step * self.batch_size + rank * share
@@ -59,7 +62,7 @@ class SampleStream:
         return batch, batch.pop('number')
 
     def shards_used(self, step: int) -> int:
-        """One past the last shard that the steps before this one have seen."""
+        """The steps before this one have seen only shards with a lower number than this."""
         if self._window is not None:
             return self._window.stop
         return self.first + self._locate(max(0, step * self.batch_size - 1))[0] + 1
@@ -71,7 +74,7 @@ class SampleStream:
         return range(self.first + max(0, stage - self.reuse + 1), self.first + stage + 1)
 
     def _locate(self, number: int) -> tuple[int, int, int]:
-        """The stage of a sample, its place in it, and the size of the stage."""
+        """The stage of a sample, its place in the stage, and the size of the stage."""
         if self.epoch_size is not None:
             return number // self.epoch_size, number % self.epoch_size, self.epoch_size
         n, k = self.shards.shard_size, self.reuse
@@ -82,7 +85,7 @@ class SampleStream:
         return stage, number - n * stage * (stage + 1) // 2, n * (stage + 1)
 
     def _read(self, stage: int, size: int, offset: int, numbers: NDArray[np.int64]) -> Iterator[Batch]:
-        """The samples of these numbers, which have their places in the stage from `offset` on; shard by shard."""
+        """The samples with these numbers, shard by shard. Their places in the stage begin at `offset`."""
         n, window = self.shards.shard_size, self.window(stage)
         if self._stage is None or self._stage[0] != stage:
             self._stage = stage, np.random.default_rng((self.seed, stage)).permutation(size)

@@ -1,4 +1,4 @@
-"""How well a network does on samples that training does not see."""
+"""How good a network is on samples that training does not see."""
 
 from __future__ import annotations
 
@@ -12,8 +12,11 @@ from hand_pose_ros.datasets.shards import DiskShards, MemoryShards
 
 
 def some_samples(shards: DiskShards | MemoryShards, count: int) -> list[Batch]:
-    """So many samples, shard by shard: of an endless dataset the first; of another, which is in the order of recording,
-    spread evenly over it, or all where there are no more."""
+    """`count` samples, shard by shard.
+
+    From an endless dataset, these are the first ones. A finite dataset is in the order of recording. So its samples are
+    spread evenly over it, or all are taken if there are fewer.
+    """
     size, n = shards.dataset.size, shards.shard_size
     numbers = torch.arange(count) if size is None else torch.linspace(
         0, size - 1, min(count, size), dtype=torch.float64).round().long()
@@ -29,11 +32,11 @@ def some_samples(shards: DiskShards | MemoryShards, count: int) -> list[Batch]:
 @torch.no_grad()
 def estimate(predict: Callable[[Tensor], Tensor], batches: Iterable[Batch], device: torch.device,
              joints: list[int] | slice = slice(None), batch_size: int = 256) -> tuple[Tensor, Tensor]:
-    """Estimated and true joints (N, J, 3) in metres of the samples that show a hand.
+    """Estimated and true joints (N, J, 3) in metres, of the samples that show a hand.
 
     Args:
         predict: patches (B, 1, 128, 128) -> joints (B, J, 3) in cube units.
-        joints: those of the skeleton that are predicted.
+        joints: numbers of the joints of the skeleton that are predicted.
     """
     estimates, truths = [], []
     for whole in batches:

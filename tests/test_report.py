@@ -117,8 +117,11 @@ def test_notes_of_all_results_are_told(result, tmp_path):
 def test_report_shows_a_frame_in_which_a_joint_is_unknown(result, tmp_path):
     truth, predictions = result.truth.copy(), result.predictions.copy()
     truth[:, 4], predictions[:, 8] = np.nan, np.nan
-    write_report([replace(result, truth=truth, predictions=predictions)], tmp_path / 'out',
-                 depth_images(replace(result, truth=np.nan_to_num(result.truth, nan=1.0))))
+    lacking = replace(result, predictions=predictions)
+    page = write_report([lacking], tmp_path, depth_images(result)).read_text()
+    assert page.count('alt="joints on the depth image: truth"') == 3
+    page = write_report([replace(lacking, truth=truth)], tmp_path, depth_images(result)).read_text()
+    assert 'alt="joints on the depth image' not in page and page.count('<canvas data-view') == 3
 
 
 def test_letters_that_no_font_has_are_no_warnings(result):

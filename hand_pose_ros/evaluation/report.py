@@ -115,15 +115,15 @@ def _cards(result: Result, read_depths: ReadDepths | None) -> list[_Card]:
         center = np.nanmean(known, axis=0)
         cube = Cube.at(center, _VIEW_SIDE_M)
         depth = depths.get(row)
-        panels = []
+        panels = {}
         for name, joints in (('estimate', estimate), ('truth', truth)):
             if depth is not None and np.isfinite(joints).all():
-                panels.append(close_up(depth, result.intrinsics, cube, joints, result.skeleton))
-                caption(panels[-1], name)
+                panels[name] = close_up(depth, result.intrinsics, cube, joints, result.skeleton)
+                caption(panels[name], name)
         kind = ('blind', 'single', '')[len(panels)]
         picture = '' if not panels else _data_image(
-            'png', cv2.imencode('.png', np.hstack(panels))[1].tobytes(),
-            'joints on the depth image: estimate' + (', truth' if len(panels) > 1 else ''))
+            'png', cv2.imencode('.png', np.hstack(list(panels.values())))[1].tobytes(),
+            f'joints on the depth image: {", ".join(panels)}')
         cards.append(_Card(
             f'<div class="frame {kind}"><h3>{escape(title)}</h3>{picture}'
             f'<canvas data-view="{len(cards)}" aria-label="3D view"></canvas></div>',

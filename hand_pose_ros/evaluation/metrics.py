@@ -156,7 +156,7 @@ def jitter_mm(joints: ArrayLike, hands: ArrayLike | None = None) -> float:
 
     Args:
         joints: (N, J, 3) in metres, consecutive frames.
-        hands: (N,) of which hand they are, for only frames of the same hand are compared; None = all of one.
+        hands: (N,) name or number of the hand. Only frames of the same hand are compared. None = it is always the same.
     """
     lengths = 1000 * np.linalg.norm(np.diff(np.asarray(joints, np.float64), n=2, axis=0), axis=-1)
     if hands is not None:

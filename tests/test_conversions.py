@@ -2,6 +2,8 @@
 
 import importlib.util
 from array import array
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
 
 import yaml
+from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import CameraInfo, RegionOfInterest
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
@@ -23,9 +26,9 @@ from hand_pose_ros.estimator import HandEstimate
 from hand_pose_ros.geometry import Cube, Intrinsics
 from hand_pose_ros.markers import HandMarkers
 from hand_pose_ros.resources import resource
-from hand_pose_ros.ros.camera import Camera
+from hand_pose_ros.ros.camera import Camera, Closed
 from hand_pose_ros.ros.conversions import hand_from_msg, hands_to_msg, markers_to_msg, skeleton_to_msg
-from hand_pose_ros.ros.diagnostics import Statistics
+from hand_pose_ros.ros.diagnostics import MAX_AGE_S, MAX_KINDS, REPEAT_S, Statistics
 from hand_pose_ros.ros.params import Params, markdown_table, yaml_file
 from hand_pose_ros.skeleton import HAND21
 
@@ -63,7 +66,8 @@ def test_the_skeleton_message_names_every_joint_and_its_parent() -> None:
     message = skeleton_to_msg(header(), HAND21, 'deep_prior', '1.0')
     assert message.joint_names[message.parents[message.joint_names.index('index_pip')]] == 'index_mcp'
     assert message.parents[message.joint_names.index('wrist')] == -1
-    assert (message.model, message.model_version) == ('deep_prior', '1.0')
+    assert (message.name, message.model, message.model_version) == ('hand21', 'deep_prior', '1.0')
+    assert message.header == header()
 
 
 def test_markers_are_joints_and_bones_in_the_colours_of_the_fingers() -> None:
@@ -77,6 +81,9 @@ def test_markers_are_joints_and_bones_in_the_colours_of_the_fingers() -> None:
     tip = HAND21.joint_names.index('pinky_tip')
     color = joints.colors[tip]
     np.testing.assert_allclose((color.r, color.g, color.b), np.array(FINGER_COLORS['pinky']) / 255, atol=1e-6)
+    assert all(color.a > 0 for marker in markers.values() for color in marker.colors)  # else nothing is seen
+    scale = joints.scale
+    assert 0.005 < scale.x == scale.y == scale.z < 0.02 and 0 < cube.scale.x < bones.scale.x < scale.x
     ends = np.array([(p.x, p.y, p.z) for p in bones.points]).reshape(-1, 2, 3)
     np.testing.assert_allclose(ends, estimate.joints[np.array(HAND21.bones)], atol=1e-6)
     for (_, child), color in zip(HAND21.bones, bones.colors[::2], strict=True):  # of the finger that it leads to
@@ -159,6 +166,49 @@ def test_intrinsics_may_be_set_one_after_the_other() -> None:
             camera.intrinsics(640, 480, Params(**some))
     both = Params(intrinsics_fx=500.0, intrinsics_fy=510.0, intrinsics_cx=320.0, intrinsics_cy=240.0)
     assert camera.intrinsics(640, 480, both) == Intrinsics(500, 510, 320, 240, 640, 480)
+
+
+def test_where_the_intrinsics_come_from_is_told() -> None:
+    camera, given_ = Camera('/camera_info'), Params(intrinsics_fx=1.0, intrinsics_fy=1.0, intrinsics_cx=1.0,
+                                                    intrinsics_cy=1.0)
+    assert (camera.source(Params()), camera.source(given_)) == ('none yet on /camera_info', 'parameters')
+    camera.update(info(header=header(frame='left')))
+    assert camera.source(Params()) == '/camera_info'
+    assert "its frame_id is 'right' but that of /camera_info is 'left'" in camera.frame_problem('right', Params())
+    assert camera.frame_problem('left', Params()) == camera.frame_problem('right', given_) == ''
+    camera.update(info())  # a driver that sets no frame says nothing about the camera
+    assert camera.frame_problem('right', Params()) == ''
+
+
+def test_an_image_waits_for_the_camera_info_that_fits_it_and_no_longer() -> None:
+    camera, params = Camera('/camera_info'), Params(camera_info_timeout=10.0)
+
+    def waiting() -> Future:
+        image = pool.submit(camera.intrinsics, 640, 480, params)
+        while not camera.waiting and not wait([image], 0.001).done:
+            pass
+        return image
+
+    with ThreadPoolExecutor() as pool:
+        camera.update(info(width=320, height=240))
+        image = waiting()
+        camera.update(info())
+        assert image.result(5).fx == 500 and not camera.waiting
+        camera.update(info(width=320, height=240))
+        image = waiting()
+        camera.close()
+        with pytest.raises(Closed):
+            image.result(5)
+        camera.update(info())
+        assert camera.intrinsics(640, 480, params).fx == 500, 'an image in flight is still answered'
+        camera.open()
+        assert camera.intrinsics(640, 480, params).fx == 500, 'it may be published only once'
+        camera.update(info(width=320, height=240))
+        image = waiting()
+        camera.update(info())
+        assert image.result(5).fx == 500
+    with pytest.raises(InputError, match=r'^/camera_info: .*640x480'):
+        camera.intrinsics(320, 240, Params(camera_info_timeout=0.0))
 
 
 def test_depth_that_cannot_hold_a_hand_is_explained() -> None:
@@ -268,3 +318,52 @@ def test_lost_images_of_a_slow_camera_are_told() -> None:
     assert '30 camera_info but only 20' in message(30, 20)
     statistics.count(received=10, answered=10)  # no camera_info any more: nothing to compare with
     assert 'but only' not in str(statistics.report('node', 'active', True, {}).message)
+
+
+def test_a_complaint_is_repeated_after_a_while_whatever_its_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 3.0  # the machine has just started
+    monkeypatch.setattr('hand_pose_ros.ros.diagnostics.time', SimpleNamespace(monotonic=lambda: now))
+    statistics = Statistics()
+    assert statistics.is_news('5 bytes are missing') and statistics.is_news('no readings')
+    now += REPEAT_S - 1
+    assert not statistics.is_news('17 bytes are missing')
+    now += 2
+    assert statistics.is_news('17 bytes are missing')
+    assert all(statistics.is_news('x' * i) for i in range(1, 3 * MAX_KINDS)) and len(statistics._logged_at) <= MAX_KINDS
+
+
+def test_a_report_tells_rates_times_and_the_worst_problem(monkeypatch: pytest.MonkeyPatch) -> None:
+    def report(state: str = 'active', **counts: int) -> DiagnosticStatus:
+        statistics.count(**counts)
+        return statistics.report('node', state, True, {'model': 'a'})
+
+    statistics = Statistics()
+    clock = SimpleNamespace(perf_counter=lambda: statistics._window.since + 2.0)
+    monkeypatch.setattr('hand_pose_ros.ros.diagnostics.time', clock)
+    for milliseconds in range(101):
+        statistics.time(total=milliseconds / 1000)
+    for nanoseconds in (-1, 50_000_000, int(MAX_AGE_S * 1e9)):  # the others are no ages: the clocks differ
+        statistics.age(nanoseconds)
+    first = report(received=30, answered=25, dropped=5, hands=50)
+    assert (first.level, first.message) == (DiagnosticStatus.OK, '25 images answered, 50 hands')
+    values = {value.key: value.value for value in first.values}
+    assert values['refused_total'] == '0'
+    assert (values['input_hz'], values['output_hz']) == ('15.0', '12.5')
+    assert (values['total_p50_ms'], values['total_p95_ms']) == ('50.00', '95.00')
+    assert values['age_p50_ms'] == values['age_p95_ms'] == '50.00'
+    second = report(received=30, answered=23, dropped=7, refused=0)
+    assert second.level == DiagnosticStatus.WARN and '7 of 30 images of a second were dropped' in second.message
+    values = {value.key: value.value for value in second.values}
+    assert [values[f'{what}_total'] for what in ('received', 'answered', 'dropped', 'refused', 'hands')] == [
+        '60', '48', '12', '0', '50']
+    assert values['model'] == 'a' and 'total_p50_ms' not in values
+    assert report(received=30, answered=4, dropped=26, waited=22).level == DiagnosticStatus.OK
+    assert report(received=9, answered=1, dropped=8).level == DiagnosticStatus.OK  # too few to tell
+    assert (report().level, report('inactive').message) == (DiagnosticStatus.STALE, 'the node is inactive')
+    statistics.silence = 'nobody publishes'
+    assert (report().level, report().message) == (DiagnosticStatus.STALE, 'nobody publishes')
+    statistics.problem('no readings')
+    last = report('inactive')  # what was wrong before is still told
+    assert (last.level, last.message) == (DiagnosticStatus.WARN, 'no readings')
+    statistics.failure = 'no such model'
+    assert report().level == DiagnosticStatus.ERROR

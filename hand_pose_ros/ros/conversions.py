@@ -54,7 +54,7 @@ def hand_from_msg(message: HandJoints, skeleton: Skeleton) -> HandEstimate:
                          f'{len(skeleton)}: publish as many, or name another skeleton')
     center = message.cube_center
     return HandEstimate(
-        joints=np.array([(point.x, point.y, point.z) for point in message.joints], np.float32).reshape(-1, 3),
+        joints=np.array([(point.x, point.y, point.z) for point in message.joints], np.float32),
         joint_names=skeleton.joint_names, confidence=np.array(message.confidence, np.float32), score=message.score,
         side=_SIDE_NAMES.get(message.side, 'unknown'), cube=Cube((center.x, center.y, center.z), message.cube_size),
         id=message.id)
@@ -76,10 +76,9 @@ def markers_to_msg(header: Header, markers: Sequence[HandMarker], lifetime_s: fl
     messages = []
     for marker in markers:
         x, y, z = marker.scale
-        message = Marker(header=header, ns=marker.namespace, type=marker.type, action=marker.action, lifetime=lifetime,
-                         scale=Vector3(x=x, y=y, z=z), points=_points(marker.points), colors=_colors(marker.colors))
-        message.pose.orientation.w = 1.0
-        messages.append(message)
+        messages.append(Marker(
+            header=header, ns=marker.namespace, type=marker.type, action=marker.action, lifetime=lifetime,
+            scale=Vector3(x=x, y=y, z=z), points=_points(marker.points), colors=_colors(marker.colors)))
     return MarkerArray(markers=messages)
 
 
@@ -128,7 +127,7 @@ def transforms_to_msgs(header: Header, hands: Sequence[HandEstimate], namespace:
 
     If the node has a namespace, for example /left, the name is left/r_index_tip, because all nodes share one /tf.
     """
-    messages, above = [], f'{namespace.strip("/")}/'.lstrip('/')
+    messages, above = [], f'{namespace}/'.lstrip('/')
     for prefix, hand in zip(prefixes(hands), hands, strict=True):
         for name, (x, y, z) in zip(hand.joint_names, hand.joints.tolist(), strict=True):
             message = TransformStamped(header=header, child_frame_id=f'{above}{prefix}{name}')
@@ -142,7 +141,7 @@ def patch_to_msg(header: Header, patch: NDArray[np.float32]) -> Image:
     """
     _, height, width = patch.shape
     return Image(header=header, height=height, width=width, encoding='32FC1', step=4 * width,
-                 is_bigendian=sys.byteorder == 'big', data=array('B', patch.astype(np.float32).tobytes()))
+                 is_bigendian=sys.byteorder == 'big', data=array('B', patch.tobytes()))
 
 
 def _points(points: ArrayLike) -> list[Point]:

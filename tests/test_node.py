@@ -41,6 +41,7 @@ from hand_pose_ros.msg import HandJointsArray, HandSkeleton  # noqa: E402
 from hand_pose_ros.ros import conversions  # noqa: E402
 from hand_pose_ros.ros import node as node_module  # noqa: E402
 from hand_pose_ros.ros.node import EstimatorNode  # noqa: E402
+from hand_pose_ros.ros.topics import input_topics  # noqa: E402
 from hand_pose_ros.ros.worker import NewestWorker  # noqa: E402
 from hand_pose_ros.skeleton import HAND21  # noqa: E402
 
@@ -320,6 +321,23 @@ def test_a_remapped_image_takes_its_camera_info_along(rig: Rig) -> None:
     rig.connected(infos)
     infos.publish(camera_info())
     assert rig.answer(publish, image(depth_with_hand())).hands
+
+
+@pytest.mark.parametrize('remaps, transport, topics', [
+    ((), 'raw', ('/depth/image_rect', '/depth/camera_info')),
+    (('depth/image_rect:=/a/b', 'depth/camera_info:=/c/info'), 'raw', ('/a/b', '/c/info')),
+    (('depth/camera_info:=/c/info',), 'compressed', ('/depth/image_rect/compressed', '/c/info')),
+    (('depth/image_rect:=/a/compressed',), 'raw', ('/a/compressed', '/a/camera_info')),
+    (('depth/image_rect:=/a/compressed',), 'compressed', ('/a/compressed', '/camera_info')),
+    (('__ns:=/left',), 'raw', ('/left/depth/image_rect', '/left/depth/camera_info'))])
+def test_the_names_of_the_topics_follow_what_is_remapped(remaps: tuple[str, ...], transport: str,
+                                                         topics: tuple[str, str]) -> None:
+    context = rclpy.Context()
+    context.init()
+    node = Node('any', context=context, cli_args=['--ros-args', *(word for rule in remaps for word in ('-r', rule))])
+    assert input_topics(node, transport) == topics
+    node.destroy_node()
+    context.shutdown()
 
 
 def test_lifecycle(rig: Rig) -> None:
@@ -718,9 +736,12 @@ def test_depth_that_is_only_compressed_is_found(rig: Rig, monkeypatch: pytest.Mo
 
 
 def test_incompatible_quality_of_service_is_named_with_its_remedy(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(node_module, 'SILENCE_S', 0.1)
+    monkeypatch.setattr(node_module, 'SILENCE_S', 1e9)  # images of others may arrive
     rig.start(**{'qos_overrides./depth/image_rect.subscription.reliability': 'reliable'})
     rig.client.create_publisher(Image, 'depth/image_rect', BEST_EFFORT)
+    rig.until_said('does not offer', '/depth/image_rect', '/client', 'best effort',
+                   '-p qos_overrides./depth/image_rect.subscription.reliability:=best_effort')
+    monkeypatch.setattr(node_module, 'SILENCE_S', 0.1)
     # In the diagnostics, too, as long as it lasts, whatever arrives beside the images.
     infos = rig.client.create_publisher(CameraInfo, 'depth/camera_info', RELIABLE)
 
@@ -729,8 +750,6 @@ def test_incompatible_quality_of_service_is_named_with_its_remedy(rig: Rig, monk
         reports = [report.status[0] for report in rig.received[DiagnosticArray]]
         return len(reports) > 3 and all(':=best_effort' in status.message for status in reports[-2:])
     rig.until(told, 'diagnostics')
-    rig.until_said('does not offer', '/depth/image_rect', '/client', 'best effort',
-                   '-p qos_overrides./depth/image_rect.subscription.reliability:=best_effort')
 
 
 def test_a_quality_of_service_that_has_no_effect_is_named(rig: Rig) -> None:

@@ -3,6 +3,7 @@
 # ruff: noqa: F811 (a fixture from another file is imported, and then an argument)
 
 import sys
+from array import array
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
@@ -13,7 +14,7 @@ pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
 
 import rclpy
 from geometry_msgs.msg import Point, PoseArray, TransformStamped
-from sensor_msgs.msg import CameraInfo, Image, JointState, RegionOfInterest
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState, RegionOfInterest
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool
 from test_node import (  # noqa: F401 (fixtures)
@@ -29,12 +30,13 @@ from test_node import (  # noqa: F401 (fixtures)
     image,
     rig,
     stamp_of,
+    stamped,
     weights,
 )
 from visualization_msgs.msg import MarkerArray
 
 from hand_pose_ros.angles import ANGLES, finger_angles
-from hand_pose_ros.depth import decode_image
+from hand_pose_ros.depth import decode_image, encode_compressed
 from hand_pose_ros.estimator import HandEstimate
 from hand_pose_ros.geometry import Cube, Intrinsics, crop
 from hand_pose_ros.models import build
@@ -47,7 +49,9 @@ from hand_pose_ros.ros.conversions import (
     prefixes,
     transforms_to_msgs,
 )
-from hand_pose_ros.ros.watch import _Watcher
+from hand_pose_ros.ros.outputs import Outputs
+from hand_pose_ros.ros.params import Params
+from hand_pose_ros.ros.watch import _Watcher, watch
 from hand_pose_ros.skeleton import HAND21
 
 pytestmark = pytest.mark.usefixtures('ros_domain')
@@ -149,7 +153,8 @@ def test_poses_angles_and_the_crop(rig: Rig) -> None:
     hand = rig.answer(publish, image(depth_with_hand(), 6)).hands[0]
     rig.until(lambda: crops and stamp_of(crops[-1]) == 6, 'the crop')
     patch = crops[-1]
-    assert (patch.width, patch.height, patch.encoding) == (128, 128, '32FC1')
+    assert (patch.width, patch.height, patch.encoding, patch.step) == (128, 128, '32FC1', 4 * 128)
+    assert patch.is_bigendian == (sys.byteorder == 'big')
     cube = Cube(tuple(xyz([hand.cube_center])[0].tolist()), hand.cube_size)
     intrinsics = Intrinsics(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT)
     seen = crop(decode_image(image(depth_with_hand())), cube, intrinsics)
@@ -158,17 +163,22 @@ def test_poses_angles_and_the_crop(rig: Rig) -> None:
     empty = rig.answer(publish, image(np.full((HEIGHT, WIDTH), 3.0), 7))
     rig.until(lambda: stamp_of(all_poses[-1]) == 7, 'no poses')
     assert empty.hands == [] and all_poses[-1].poses == []
-    assert stamp_of(all_states[-1]) == stamp_of(crops[-1]) == 6
+    rig.answer(publish, image(depth_with_hand(), 8))
+    rig.until(lambda: stamp_of(crops[-1]) == stamp_of(all_states[-1]) == 8, 'the next crop and angles')
+    assert not {7} & {stamp_of(message) for message in (*crops, *all_states)}
+    assert not rig.node._statistics._totals['refused']
 
 
-def test_angles_need_the_joints_of_hand21(rig: Rig, tmp_path) -> None:
-    path = tmp_path / 'nyu.safetensors'
-    save_checkpoint(path, build('deep_prior', joints=14), {'skeleton': 'nyu14', 'cube_side': 0.3})
+@pytest.mark.parametrize('skeleton, joints', [('nyu14', 14), ('msra21', 21)])
+def test_angles_need_the_joints_of_hand21(rig: Rig, tmp_path, skeleton: str, joints: int) -> None:
+    path = tmp_path / 'other.safetensors'
+    save_checkpoint(path, build('deep_prior', joints=joints), {'skeleton': skeleton, 'cube_side': 0.3})
     rig.start(publish_joint_states=True, model=str(path))
-    rig.until_said('publish_joint_states', 'hand21', 'nyu14')
+    rig.until_said('publish_joint_states', 'hand21', skeleton)
     assert rig.state() == 'unconfigured' and rig.set_parameter('publish_joint_states', False)[0]
     assert rig.transition('configure') and rig.transition('activate')
-    assert len(rig.answer(rig.camera(info=camera_info()), image(depth_with_hand())).hands[0].joints) == 14
+    answer = rig.answer(rig.camera(info=camera_info()), image(depth_with_hand()))
+    assert (answer.skeleton, len(answer.hands[0].joints)) == (skeleton, joints)
 
 
 @pytest.mark.parametrize('parameter, value, package', [
@@ -199,6 +209,32 @@ def test_frames_of_the_joints_on_tf(rig: Rig) -> None:
     rig.until_said('frame_id', 'empty', 'tf')
 
 
+def test_what_goes_to_tf_and_when(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a stand-in for tf2_msgs, which has no wheels, and for the node."""
+    sent: dict[str, list] = {}
+    stand_in = ModuleType('tf2_msgs.msg')
+    stand_in.TFMessage = SimpleNamespace
+    monkeypatch.setitem(sys.modules, 'tf2_msgs', ModuleType('tf2_msgs'))
+    monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', stand_in)
+
+    def create(kind: type, topic: str, _: object) -> SimpleNamespace:
+        return SimpleNamespace(publish=sent.setdefault(topic, []).append, msg_type=kind,
+                               get_subscription_count=lambda: 1)
+
+    said: list[str] = []
+    params = Params(publish_tf=True, publish_markers=False)
+    outputs = Outputs(SimpleNamespace(create_lifecycle_publisher=create, get_namespace=lambda: '/left'),
+                      SimpleNamespace(skeleton=HAND21, metadata={}), params, said.append)
+    for frame, hands in (('camera', [estimate()]), ('camera', []), ('', []), ('', [estimate()])):
+        outputs.publish_others(Header(frame_id=frame), hands, np.zeros((HEIGHT, WIDTH), np.float32),
+                               Intrinsics(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT), params)
+        assert len(said) == (frame == '' and len(hands))
+    assert 'frame_id of the depth image is empty' in said[0]
+    [frames] = sent['/tf']  # of all nodes, whatever their namespace
+    assert [t.child_frame_id for t in frames.transforms] == [f'left/r_{name}' for name in HAND21.joint_names]
+    assert len(sent['~/debug/crop']) == 2 and not sent['hand/markers']
+
+
 def test_joints_in_the_target_frame(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     """With a stand-in for tf2_ros, which has no wheels: what it is asked, and what is made of its answer."""
     asked: list[tuple] = []
@@ -207,6 +243,7 @@ def test_joints_in_the_target_frame(rig: Rig, monkeypatch: pytest.MonkeyPatch) -
 
     class Buffer:
         def lookup_transform(self, target, source, when, timeout):
+            assert timeout.nanoseconds > 0  # the transform may come a little later than the image
             asked.append((target, source, when.nanoseconds))
             if source == 'lost':
                 raise stand_in.TransformException('two unconnected trees')
@@ -303,10 +340,39 @@ def test_what_is_live_is_shown_with_a_camera_info_that_was_published_once_before
             rclpy.spin_once(watcher._node, timeout_sec=0.05)
             return bool(cameras)
         rig.until(shown, 'a depth image')
+        listeners = len(list(watcher._node.subscriptions))
+        watcher._listen_to_latched()  # which it does each second
+        assert len(list(watcher._node.subscriptions)) == listeners
         watcher._node.destroy_node()
     finally:
         rclpy.try_shutdown()
     assert cameras[0].fx == FOCAL
+
+
+def test_what_is_live_is_shown_until_ros_ends(rig: Rig) -> None:
+    layout, data = encode_compressed(depth_with_hand())
+    picture = stamped(CompressedImage(format=layout, data=array('B', data)), 1234)
+    hands = hands_to_msg(picture.header, [estimate()], HAND21)
+    topics = {'/front/depth/image/compressedDepth': picture, '/front/depth/camera_info': camera_info(),
+              '/hand/joints': hands}
+    publishers = [rig.client.create_publisher(type(message), topic, RELIABLE) for topic, message in topics.items()]
+    depths, shown, rounds = [], [], iter(range(200))
+
+    def publish() -> None:
+        for publisher, message in zip(publishers, topics.values(), strict=True):
+            publisher.publish(message)
+        if (depths and shown) or next(rounds, None) is None:
+            rclpy.try_shutdown()
+
+    rig.client.create_timer(0.05, publish)
+    watch(lambda *seen: depths.append(seen), lambda *seen: shown.append(seen), 'compressedDepth', 0.002,
+          ros_args=['-r', 'depth/image_rect:=/front/depth/image'])
+    stamp, depth, camera = depths[0]
+    assert (stamp, camera.fx) == (1_234_000_000, FOCAL)
+    np.testing.assert_allclose(depth, 2 * depth_with_hand(), atol=0.002)
+    stamp, [hand], skeleton = shown[0]
+    assert (stamp, skeleton) == (1_234_000_000, HAND21)
+    np.testing.assert_array_equal(hand.joints, estimate().joints)
 
 
 def test_what_is_live_is_shown_with_intrinsics_that_are_given():
@@ -329,13 +395,14 @@ def test_hands_that_do_not_fit_are_not_shown_live():
     try:
         shown, said = [], []
         watcher = _Watcher(lambda *_: None, lambda *hands: shown.append(hands), 'raw', 0.001)
-        watcher._complain = said.append
+        watcher._node.get_logger = lambda: SimpleNamespace(warning=said.append)
         picture = image(depth_with_hand(), 1000)
         watcher._image(picture)
         message = HandJointsArray(header=picture.header, skeleton='hand21')
         watcher._hands(message)
         message.hands = [HandJoints(joints=[Point()] * 20, confidence=[1.0] * 20, cube_size=0.3)]
-        watcher._hands(message)
+        for _ in range(3):  # which is said once
+            watcher._hands(message)
         message.header.frame_id = 'base_link'
         watcher._hands(message)
         message.skeleton = 'paw'
@@ -343,6 +410,6 @@ def test_hands_that_do_not_fit_are_not_shown_live():
         watcher._node.destroy_node()
     finally:
         rclpy.try_shutdown()
-    assert len(shown) == 1
+    assert len(shown) == 1 and len(said) == len(set(said))
     assert 'a hand has 20 joints and 20 confidences, but hand21 has 21' in said[-3]
     assert "in frame 'base_link', but the images in" in said[-2] and 'paw' in said[-1]

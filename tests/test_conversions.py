@@ -1,4 +1,4 @@
-"""Messages, markers, camera models and parameters, without a network in between."""
+"""Messages, markers, camera models, topics and parameters, without a network in between."""
 
 import importlib.util
 from array import array
@@ -13,7 +13,8 @@ pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
 
 import yaml
 from diagnostic_msgs.msg import DiagnosticStatus
-from sensor_msgs.msg import CameraInfo, RegionOfInterest
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, Image, RegionOfInterest
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
@@ -26,6 +27,7 @@ from hand_pose_ros.estimator import HandEstimate
 from hand_pose_ros.geometry import Cube, Intrinsics
 from hand_pose_ros.markers import HandMarkers
 from hand_pose_ros.resources import resource
+from hand_pose_ros.ros import topics
 from hand_pose_ros.ros.camera import Camera, Closed
 from hand_pose_ros.ros.conversions import hand_from_msg, hands_to_msg, markers_to_msg, skeleton_to_msg
 from hand_pose_ros.ros.diagnostics import MAX_AGE_S, MAX_KINDS, REPEAT_S, Statistics
@@ -367,3 +369,68 @@ def test_a_report_tells_rates_times_and_the_worst_problem(monkeypatch: pytest.Mo
     assert (last.level, last.message) == (DiagnosticStatus.WARN, 'no readings')
     statistics.failure = 'no such model'
     assert report().level == DiagnosticStatus.ERROR
+
+
+class Graph:
+    """A node that sees these topics, each with its publishers, and listens to `/depth` as it was asked to."""
+
+    publishers = (SimpleNamespace(topic_name='/estimator/debug/crop'),)
+
+    def __init__(self, listens: ReliabilityPolicy = ReliabilityPolicy.BEST_EFFORT, **publishers: list) -> None:
+        self.infos = {f'/{topic}': infos for topic, infos in publishers.items()}
+        self.subscriptions = [
+            SimpleNamespace(topic_name=topic, qos_profile=QoSProfile(depth=1, reliability=reliability))
+            for topic, reliability in (('/depth', listens), ('/other', ReliabilityPolicy.RELIABLE))]
+
+    def get_publishers_info_by_topic(self, topic: str) -> list:
+        return self.infos.get(topic, [])
+
+    def count_publishers(self, topic: str) -> int:
+        return len(self.get_publishers_info_by_topic(topic))
+
+    def get_topic_names_and_types(self) -> list[tuple[str, list[str]]]:
+        types = [(topic, [info.topic_type for info in infos]) for topic, infos in self.infos.items()]
+        return [*types, ('/depth', ['sensor_msgs/msg/Image']), ('/estimator/debug/crop', ['sensor_msgs/msg/Image'])]
+
+    def create_subscription(self, *_: object, **__: object) -> str:
+        return 'a subscription'
+
+
+def publisher(name: str = 'camera', namespace: str = '/', kind: str = 'Image', **qos: object) -> SimpleNamespace:
+    return SimpleNamespace(node_name=name, node_namespace=namespace, topic_type=f'sensor_msgs/msg/{kind}',
+                           qos_profile=QoSProfile(depth=1, **qos))
+
+
+def test_why_no_image_arrives_is_told() -> None:
+    def told(**graph: object) -> str:
+        return topics.explain_silence(Graph(**graph), '/depth', Image, 5.0)
+
+    best_effort, reliable = ({'reliability': policy} for policy in (ReliabilityPolicy.BEST_EFFORT,
+                                                                    ReliabilityPolicy.RELIABLE))
+    assert '5 s; the topic is without any publisher: start the camera' in told(points=[publisher(kind='PointCloud2')])
+    assert 'publisher (sensor_msgs/msg/Image is published on /a, /b): start the camera' in told(
+        a=[publisher()], points=[publisher(kind='PointCloud2')], b=[publisher()])
+    points = publisher(kind='PointCloud2')
+    assert 'but sensor_msgs/msg/Image is expected' in told(depth=[points])
+    for publishers, listens in (([points, publisher()], ReliabilityPolicy.BEST_EFFORT),
+                                ([publisher(**best_effort)], ReliabilityPolicy.BEST_EFFORT),
+                                ([publisher(**best_effort), publisher(**reliable)], ReliabilityPolicy.RELIABLE)):
+        assert 'if it does publish, start the camera driver with' in told(depth=publishers, listens=listens)
+    assert 'does not offer the reliability' in told(depth=[publisher(**best_effort)],
+                                                    listens=ReliabilityPolicy.RELIABLE)
+    assert topics.explain_incompatible(Graph(), '/depth', 'durability').endswith('.durability:=volatile')
+
+
+def test_publishers_are_named_in_one_order() -> None:
+    unknown = publisher('_NODE_NAME_UNKNOWN_')
+    driver = publisher('driver', '/front', reliability=ReliabilityPolicy.BEST_EFFORT)
+    for publishers in ([unknown, driver, publisher()], [publisher(), driver, unknown]):  # else it were news each second
+        assert topics.describe_publishers(Graph(depth=publishers), '/depth') == (
+            'published by /camera (sensor_msgs/msg/Image, reliable, volatile), /front/driver (sensor_msgs/msg/Image, '
+            'best effort, volatile), a node (sensor_msgs/msg/Image, reliable, volatile)')
+
+
+def test_what_is_kept_is_asked_for_only_where_all_keep_it() -> None:
+    kept, other = publisher(durability=DurabilityPolicy.TRANSIENT_LOCAL), publisher()
+    for publishers, expected in (([], None), ([kept, other], None), ([kept, kept], 'a subscription')):
+        assert topics.subscribe_latched(Graph(info=publishers), CameraInfo, '/info', print) == expected

@@ -4,6 +4,8 @@ import json
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -13,14 +15,16 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
 
-from hand_pose_ros.bags import BagWriter
+from hand_pose_ros.bags import BagWriter, DepthBag
 from hand_pose_ros.cli import main
 from hand_pose_ros.cli.demo import _truth, summarise
+from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.estimator import HandEstimate
 from hand_pose_ros.geometry import Cube, Intrinsics
 from hand_pose_ros.models import build
 from hand_pose_ros.models.checkpoints import save_checkpoint
 from hand_pose_ros.msg import HandJointsArray
+from hand_pose_ros.ros import live
 from hand_pose_ros.ros.live import Answers
 from hand_pose_ros.skeleton import HAND21, get_skeleton
 
@@ -73,6 +77,39 @@ def test_a_node_that_cannot_start_is_not_waited_for(tmp_path: Path, ros_domain: 
     write_bag(tmp_path / 'hand.mcap')
     assert main(['demo', '--bag', str(tmp_path / 'hand.mcap'), '--model', 'nope', '--out', str(tmp_path / 'out')]) == 1
     assert "hand-pose demo: the node does not start: there is no checkpoint named 'nope'" in capfd.readouterr().err
+
+
+def ends(code: int) -> list[str]:
+    return [sys.executable, '-c', f'raise SystemExit({code})']
+
+
+def test_a_node_that_ends_or_hangs_at_its_start_is_told() -> None:
+    with subprocess.Popen(ends(3)) as process, pytest.raises(HandPoseError, match='ended with exit code 3 before'):
+        live._wait_until(lambda: False, process, 60.0)
+    with subprocess.Popen([sys.executable, '-c', 'input()'], stdin=subprocess.PIPE) as process, \
+            pytest.raises(HandPoseError, match='the node was not ready after 0 s'):
+        live._wait_until(lambda: False, process, 0.0)
+
+
+def test_a_node_that_dies_while_it_is_shown_images_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
+                                                           ros_domain: int) -> None:
+    asked: list[str] = []
+
+    @contextmanager
+    def dead(arguments: list[str]) -> Iterator[subprocess.Popen[bytes]]:
+        asked.extend(arguments)
+        process = subprocess.Popen(ends(7))
+        process.wait()
+        yield process
+
+    monkeypatch.setattr(live, '_running', dead)
+    monkeypatch.setattr(live, '_wait_until', lambda *_: None)
+    monkeypatch.setattr(live, 'QUIET_S', 0.0)
+    monkeypatch.setattr(live.Replay, 'wait_for_subscribers', lambda *_: None)
+    write_bag(tmp_path / 'hand.mcap')
+    with DepthBag(tmp_path / 'hand.mcap') as bag, pytest.raises(HandPoseError, match='the node died with exit code 7'):
+        live.play_through_node(bag, '/elsewhere/camera_info', {'model': 'a: b'})
+    assert {'transport:="compressedDepth"', 'model:="a: b"', 'depth/camera_info:=/elsewhere/camera_info'} <= set(asked)
 
 
 def test_an_image_without_an_answer_is_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """`hand-pose demo`: a bag goes through the live node, and pictures and numbers come out."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -110,6 +111,8 @@ def test_a_node_that_dies_while_it_is_shown_images_is_told(monkeypatch: pytest.M
     with DepthBag(tmp_path / 'hand.mcap') as bag, pytest.raises(HandPoseError, match='the node died with exit code 7'):
         live.play_through_node(bag, '/elsewhere/camera_info', {'model': 'a: b'})
     assert {'transport:="compressedDepth"', 'model:="a: b"', 'depth/camera_info:=/elsewhere/camera_info'} <= set(asked)
+    own = f'/evaluation_{os.getpid()}'  # a node of the user that runs beside is not disturbed
+    assert {f'__ns:={own}', f'/diagnostics:={own}/diagnostics'} <= set(asked)
 
 
 def test_an_image_without_an_answer_is_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -397,10 +397,10 @@ def test_the_live_node_is_shown_a_damaged_bag_as_far_as_it_goes(ros_domain, tmp_
 
 def test_images_of_one_stamp_are_not_played_through_the_node(tmp_path, model, capsys):
     pytest.importorskip('rclpy', reason='ROS is not installed')
-    bag = record(tmp_path / 'still.mcap', step_ns=0)
+    bag = record(tmp_path / 'still.mcap', frames=2, step_ns=0)
     assert main(arguments(bag, model)) == 0
     assert main(arguments(bag, model, '--via-ros')) == 1
-    assert f'still.mcap: {FRAMES} images have the stamp 1000000000 ns' in capsys.readouterr().err
+    assert 'still.mcap: 2 images have the stamp 1000000000 ns' in capsys.readouterr().err
 
 
 @pytest.mark.skipif(not Path('/proc/self/task').exists(), reason='looks for processes in /proc')

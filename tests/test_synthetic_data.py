@@ -13,6 +13,7 @@ from hand_pose_ros.cli import main
 from hand_pose_ros.detection import detect
 from hand_pose_ros.geometry import Cube, Intrinsics
 from hand_pose_ros.geometry import crop as crop_one
+from hand_pose_ros.skeleton import HAND21
 from hand_pose_ros.synthetic import benchmark, effects, sensors
 from hand_pose_ros.synthetic.crops import crop, settle
 from hand_pose_ros.synthetic.effects import Shot
@@ -106,6 +107,43 @@ def test_visible_joints_lie_just_behind_the_surface():
     assert deep.quantile(0.98) < 40 and deep.median() > 4
     hidden = behind_mm[clean['hand_present'][:, None] & ~clean['visible'] & inside & ~cut]
     assert len(hidden) == 0 or hidden.median() > deep.median()
+
+
+def test_the_surface_is_where_the_joints_say_to_a_tenth_of_a_millimetre():
+    """Hands of sticks, whose surface is known: 12 mm around the bones at the wrist, 8 mm around all others."""
+    sticks = SyntheticHands('val', sensors=['kinect1'], ingredients=Ingredients(
+        noise=False, scenes=False, surface=False, forearm=False))
+    sides = set()
+    for index in (0, 2, 4):
+        depth, camera, joints, side = sticks.full_frame(index)
+        row, column = depth.nonzero()
+        seen = camera.back_project(np.stack([column, row], -1), depth[row, column])
+        outside = []
+        for parent, child in HAND21.bones:
+            start, along = joints[parent].astype(float), (joints[child] - joints[parent]).astype(float)
+            offset = seen - start
+            part = np.clip(offset @ along / (along @ along), 0, 1)
+            outside.append(np.linalg.norm(offset - part[:, None] * along, axis=1) - (0.012 if parent == 0 else 0.008))
+        assert len(seen) > 1500
+        np.testing.assert_allclose(np.min(outside, 0), 0, atol=1e-4)
+        sides.add(side)
+    assert sides == {'left', 'right'}
+
+
+@pytest.mark.parametrize('sensor', ['pmd', 'd415'])
+def test_a_patch_is_the_products_crop_of_the_whole_image(sensor):
+    """Exactly, but that of an image finer than the patch other pixels are left out."""
+    alone = SyntheticHands('val', sensors=[sensor], ingredients=Ingredients(noise=False, scenes=False), chunk=12)
+    batch = alone.batch(torch.arange(12))
+    cubes = zip(batch['cube_center'].tolist(), batch['cube_side'].tolist(), strict=True)
+    for index, (center, side) in enumerate(cubes):
+        depth, camera, *_ = alone.full_frame(index)
+        expected = crop_one(depth, Cube(tuple(center), side), camera)
+        if batch['side'][index] == LEFT:
+            expected = expected[..., ::-1]
+        fine = camera.fx * side / center[2] > 128
+        off = np.abs(batch['patch'][index].numpy() - expected) > 0.03
+        assert off.mean() <= (0.02 if fine else 0.001)
 
 
 def test_batched_crop_equals_the_products_crop():

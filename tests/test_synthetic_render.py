@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.synthetic import renderer
 from hand_pose_ros.synthetic.renderer import View, depth_of, rasterise
 
@@ -20,13 +21,17 @@ pytestmark = pytest.mark.usefixtures('one_thread')
 
 def view(batch: int = 1, focal: float = 200.0, height: int = SIZE, width: int = SIZE + 8) -> View:
     one = torch.ones(batch)
-    return View(focal * one, 1.02 * focal * one, 50.3 * one, 47.6 * one, height, width)
+    return View(focal * one, 1.1 * focal * one, 50.3 * one, 47.6 * one, height, width)
+
+
+def camera(v: View) -> Intrinsics:
+    return Intrinsics(*(float(t[0]) for t in (v.fx, v.fy, v.cx, v.cy)), v.width, v.height)
 
 
 def points(depth: Tensor, v: View) -> Tensor:
-    """(B, H, W, 3) in metres."""
-    x, y = v.rays
-    return torch.stack([x * depth, y * depth, depth], -1).double()
+    """(1, H, W, 3) in metres, as the product sees a depth image."""
+    pixels = np.stack(np.meshgrid(np.arange(v.width), np.arange(v.height)), -1)
+    return torch.from_numpy(camera(v).back_project(pixels, depth[0].numpy()))[None]
 
 
 def icosphere(times: int) -> tuple[Tensor, Tensor]:
@@ -89,6 +94,11 @@ def test_overlapping_triangles_equal_brute_force(seed):
     torch.testing.assert_close(image[0][sure].double(), expected[sure], rtol=2e-3, atol=0)
 
 
+def test_points_are_seen_where_the_product_projects_them():
+    v, several = view(), torch.tensor([[[0.1, -0.2, 0.7], [-0.03, 0.05, 0.4]]])
+    np.testing.assert_allclose(torch.stack(v.project(several), -1).numpy(), camera(v).project(several), rtol=1e-5)
+
+
 def test_mesh_of_a_ball_looks_like_the_ball():
     corners, faces = icosphere(4)
     center, v = torch.tensor([[0.03, -0.02, 0.5]]), view()
@@ -103,13 +113,45 @@ def test_mesh_of_a_ball_looks_like_the_ball():
     assert depth_of(ball)[0, middle[1], middle[0]] == pytest.approx(0.42, abs=2e-3)
 
 
-def test_mesh_that_leaves_the_image_is_cut_and_not_wrapped_around():
+def test_solids_look_like_their_meshes():
+    """Seen askew, with measures that differ: the same outline, and the same side of it."""
+    axes = torch.linalg.qr(torch.tensor([[[1.0, 0.3, -0.2], [0.1, 0.9, 0.4], [-0.5, 0.2, 1.0]]]))[0]
+    axes[:, :, 0] *= axes.det()
+    center, size, v = torch.tensor([[0.01, 0.02, 0.5]]), torch.tensor([[0.05, 0.03, 0.08]]), view()
+    cube = torch.tensor([[x, y, z] for x in (-1.0, 1) for y in (-1.0, 1) for z in (-1.0, 1)])
+    sides = torch.tensor([q for a, b, c, d in ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4),
+                                               (1, 5, 7, 3)) for q in ((a, b, c), (a, c, d))])
+    for draw, (corners, faces), tolerance in ((renderer.ellipsoid, icosphere(4), 6e-4),
+                                              (renderer.box, (cube, sides), 1e-5)):
+        solid = draw(center, axes, size, v)
+        mesh = rasterise((corners * size) @ axes[0].T + center[:, None], faces, v)
+        assert ((mesh > 0) != (solid > 0)).sum() <= 15
+        both = (mesh > 0) & (solid > 0)
+        assert both.sum() > 600
+        assert (depth_of(mesh) - depth_of(solid))[both].abs().quantile(0.98) < tolerance
+
+
+@pytest.mark.parametrize('center', [(-0.1, 0.1, 0.5), (0.14, -0.11, 0.5)])
+def test_mesh_that_leaves_the_image_is_cut_and_not_wrapped_around(center):
     corners, faces = icosphere(3)
     v = view()
-    small = rasterise(corners[None] * 0.1 + torch.tensor([-0.1, 0.1, 0.5]), faces, v)
+    small = rasterise(corners[None] * 0.1 + torch.tensor(center), faces, v)
     wide = View(v.fx, v.fy, v.cx + 60, v.cy + 60, v.height + 120, v.width + 120)
-    large = rasterise(corners[None] * 0.1 + torch.tensor([-0.1, 0.1, 0.5]), faces, wide)
+    large = rasterise(corners[None] * 0.1 + torch.tensor(center), faces, wide)
     torch.testing.assert_close(small, large[:, 60:-60, 60:-60], rtol=1e-5, atol=0)
+    assert large[:, 60:-60, 60:-60].any() and (large > 0).sum() > (small > 0).sum()
+
+
+def test_mesh_that_reaches_the_camera_is_drawn_as_far_as_a_sensor_sees():
+    """An arm from behind the camera: what is left out is what comes too near, and nothing is turned inside out."""
+    for fineness in (1, 3):
+        corners, faces = icosphere(fineness)
+        arm, v = corners[None] * torch.tensor([0.04, 0.04, 0.4]) + torch.tensor([0.05, 0.04, 0.25]), view()
+        far = (arm[0, :, 2][faces] > renderer.NEAR).all(1)
+        assert 0.3 < far.float().mean() < 0.8
+        image = rasterise(arm, faces, v)
+        assert torch.equal(image, rasterise(arm, faces[far], v))
+        assert image.any() and depth_of(image)[image > 0].min() > renderer.NEAR
 
 
 def test_plane_is_exact():
@@ -151,11 +193,20 @@ def test_nothing_behind_the_camera_is_drawn():
     assert not renderer.plane(torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([-0.5]), v).any()
     corners, faces = icosphere(2)
     assert not rasterise(corners[None] * 0.1 + back, faces, v).any()
+    # Nor is the inside of what the camera is in.
+    around, size = torch.tensor([[0.01, 0.0, 0.02]]), torch.full((1, 3), 0.1)
+    assert not renderer.ellipsoid(around, torch.eye(3)[None], size, v).any()
+    assert not renderer.round_cone(around, around - 0.1, size[:, 0], size[:, 0], v).any()
+    assert not renderer.box(around, torch.eye(3)[None], size, v).any()
 
 
 def test_a_sample_does_not_depend_on_its_batch():
     corners, faces = icosphere(3)
     many = torch.stack([corners * (0.03 + 0.01 * i) + torch.tensor([0.01 * i, 0, 0.4 + 0.05 * i]) for i in range(5)])
-    together = rasterise(many, faces, view(5))
+    at, each = view(5), torch.arange(5.0)
+    v = View(at.fx + 9 * each, at.fy - 7 * each, at.cx + each, at.cy - 2 * each, at.height, at.width)
+    together = rasterise(many, faces, v)
     for i in range(5):
-        assert torch.equal(rasterise(many[i:i + 1], faces, view(1))[0], together[i])
+        alone = View(v.fx[i:i + 1], v.fy[i:i + 1], v.cx[i:i + 1], v.cy[i:i + 1], v.height, v.width)
+        assert torch.equal(rasterise(many[i:i + 1], faces, alone)[0], together[i])
+        assert torch.equal(rasterise(many[i:i + 1], faces, v[torch.tensor([i])])[0], together[i])

@@ -2,6 +2,8 @@
 
 import math
 import shutil
+from dataclasses import replace
+from itertools import product
 
 import cv2
 import numpy as np
@@ -203,11 +205,11 @@ def test_sensors_read_a_wall_right_and_nothing_as_nothing(name):
     assert error.max() > 0, 'no sensor is perfect'
 
 
-def _shot(batch: int, sensor: str, mirrored: bool = False) -> Shot:
+def _shot(batch: int, sensor: str, mirrored: bool = False, scale: float = 1.0) -> Shot:
     s = SENSORS[sensors.get_sensor(sensor)]
     as_tensor = lambda value: torch.full((batch, 1, 1), value)  # noqa: E731
     rng = Random(torch.arange(batch))
-    return Shot(rng.fork(1), rng, as_tensor(s.intrinsics.fx), as_tensor(1.0), as_tensor(1.0),
+    return Shot(rng.fork(1), rng, as_tensor(s.intrinsics.fx * scale), as_tensor(scale), as_tensor(1.0),
                 as_tensor(mirrored), as_tensor(s.baseline), as_tensor(s.noise), as_tensor(max(s.step, 1e-3)),
                 as_tensor(s.smoothing), 60, 120)
 
@@ -220,6 +222,77 @@ def test_shadow_is_on_one_side_and_as_wide_as_the_disparity_step():
         lost = effects.shadow(clean, _shot(1, 'primesense', mirrored)) == 0
         assert abs(int(lost[0, 30].sum()) - expected) <= 1.5
         assert lost[0, 30, side].sum() == lost[0, 30].sum()
+        lost = effects.shadow(clean, _shot(1, 'primesense', mirrored, scale=0.5)) == 0
+        assert abs(int(lost[0, 30].sum()) - expected / 2) <= 2, 'half the pixels'
+
+
+def test_steps_are_frayed_lost_or_mixed_while_surfaces_stay():
+    """Each effect alone, where the last column at 0.8 m meets the first at 0.5 m."""
+    far, near = torch.tensor(1 / 0.8), torch.tensor(1 / 0.5)
+    clean = torch.where(torch.arange(120) < 60, far, near).expand(20, 60, 120)
+
+    def shown(effect, sensor, image=clean, scale=1.0):
+        result = effect(image, _shot(20, sensor, scale=scale))
+        touched = (result != image).float().mean((0, 1))
+        return result, touched[59], touched[60], torch.cat([touched[:58], touched[62:]]).max()
+
+    frayed, behind, before, elsewhere = shown(effects.jitter, 'primesense')
+    assert set(frayed.unique().tolist()) == {far.item(), near.item()} and elsewhere == 0
+    assert 0.05 < behind < 0.4 and 0.05 < before < 0.4
+    assert shown(effects.jitter, 'primesense', scale=0.25)[1] < behind / 4, 'less of a pixel that is larger'
+    lost, behind, before, elsewhere = shown(effects.matching_window, 'primesense')
+    assert 0.6 < behind < 0.95 and 0 < before < 0.2 and elsewhere == 0 and not lost[lost != clean].any()
+    assert torch.equal(shown(effects.grazing_holes, 'primesense')[0], clean), 'a step is no grazing surface'
+    bulged, behind, before, elsewhere = shown(effects.fattening, 'd435')
+    assert 0.3 < behind < 0.9 and before == elsewhere == 0 and (bulged[bulged != clean] == near).all()
+    mixed, behind, before, elsewhere = shown(effects.flying_pixels, 'kinect2')
+    flying = mixed[(mixed != clean) & (mixed != 0)]
+    assert behind > 0.8 and before == elsewhere == 0 and 0 < len(flying) < 0.2 * 20 * 60
+    assert (far <= flying).all() and (flying <= near).all() and ((far < flying) & (flying < near)).any()
+    smeared, _, _, elsewhere = shown(effects.edge_smear, 'kinect2')
+    grown = 1 / smeared[..., 59] - 0.5
+    grown = grown[grown < 0.1]
+    assert len(grown) > 0.6 * 20 * 60 and grown.min() > 0.0035 and grown.max() < 0.0405 and elsewhere == 0
+    assert (1 / smeared[..., 60:] - 0.5).abs().max() < 0.01
+    assert (shown(effects.edge_smear, 'kinect2', scale=0.25)[0][..., 59] > 1 / 0.6).float().mean() < 0.5
+    rough = clean + 0.01 * Random(torch.arange(20)).normal(60, 120)
+    smooth, behind, before, _ = shown(effects.smoothing, 'sr305', rough)
+    assert behind == before == 0 and (smooth - clean)[..., :58].std() < 0.005
+
+
+def test_noise_has_the_measured_size_and_does_not_shift_surfaces():
+    # In a window where every other pixel is left out, those that remain are as they were.
+    for scale, (normal, tangent) in product((1.0, 0.5), (([0, 0, 1], 0), ([2, 0, 1], 2), ([0, 2, 1], 2))):
+        v = View(*(torch.tensor([t]) for t in (364.5 * scale, 364.5 * scale, 60.0, 30.0)), 60, 120)
+        image = plane(torch.tensor([normal]).float(), torch.tensor([1.0]), v).expand(40, -1, -1)
+        off = (1 / effects.tof_noise(image, _shot(40, 'kinect2', scale=scale)) - 1 / image)[:, 25:36, 55:66]
+        sigma = (1.5 - 0.5 + 0.3 + 0.1 * tangent ** 2) * 1e-3 * 1.3  # Fankhauser 2015 at 1 m, times that of the sensor
+        assert off.std() == pytest.approx(sigma, rel=0.1) and off.mean().abs() < sigma / 5
+    image = torch.linspace(1 / 0.6, 1 / 0.65, 120).expand(20, 60, 120)
+    for scale in (1.0, 0.5):
+        off = (effects.disparity_noise(image, _shot(20, 'primesense', scale=scale)) - image) * 588.03 * 0.075
+        assert off.std() == pytest.approx(math.hypot(0.045, 1 / 8 / math.sqrt(12)), rel=0.1)
+        assert off.mean().abs() < 0.005
+    assert not effects.disparity_noise(torch.zeros(1, 60, 120), _shot(1, 'primesense')).any()
+
+
+def test_light_that_bounces_in_a_hollow_makes_it_deeper():
+    row, column = torch.meshgrid(torch.arange(60), torch.arange(120), indexing='ij')
+    depth = (0.5 + 0.02 * torch.exp(-((row - 30) ** 2 + (column - 60) ** 2) / 36)).expand(20, -1, -1)
+    deeper = 1 / effects.multipath(1 / depth, _shot(20, 'kinect2')) - depth
+    assert 5e-4 < deeper[:, 28:33, 58:63].mean() < 0.01
+    assert deeper.min() > -1e-6 and deeper[:, :, :20].abs().max() < 1e-6
+
+
+def test_dark_spots_last_and_specks_do_not():
+    clean = torch.ones(40, 60, 120)
+    first, again = (effects.dark_spots(clean, replace(_shot(40, 'kinect2'), rng=Random(torch.arange(40)).fork(frame)))
+                    for frame in (1, 2))
+    lost = torch.stack([first, again]) == 0
+    assert ((first == 0) | (first == 1)).all() and 2e-4 < lost.float().mean() < 0.02
+    wide = torch.nn.functional.avg_pool2d(lost.float(), 3, 1, 1) > 0.99  # in patches
+    assert wide.any() and torch.equal(wide[0], wide[1])
+    assert (lost[0] != lost[1]).sum() > 50
 
 
 def test_disparity_comes_in_steps_that_grow_with_distance():
@@ -232,10 +305,11 @@ def test_disparity_comes_in_steps_that_grow_with_distance():
 
 def test_grazing_surfaces_are_lost_and_frontal_ones_are_not():
     v = View(*(torch.tensor([t]) for t in (588.0, 588.0, 60.0, 30.0)), 60, 120)
-    for tangent, low, high in ((0.3, 0.95, 1.0), (12.0, 0.0, 0.05)):
-        image = plane(torch.tensor([[tangent, 0.0, 1.0]]), torch.tensor([0.6]), v)
-        kept = (effects.grazing_holes(image, _shot(1, 'primesense')) > 0).float().mean()
-        assert low <= kept <= high
+    for tangent, low, high in ((0.3, 0.95, 1.0), (3.0, 0.6, 0.95), (5.5, 0.05, 0.4), (12.0, 0.0, 0.05)):
+        for normal in ([tangent, 0.0, 1.0], [0.0, tangent, 1.0]):
+            image = plane(torch.tensor([normal]), torch.tensor([0.6]), v).expand(20, -1, -1)
+            kept = (effects.grazing_holes(image, _shot(20, 'primesense')) > 0).float().mean()
+            assert low <= kept <= high
 
 
 @pytest.mark.parametrize('without', ['surface', 'poses', 'forearm', 'scenes', 'noise', 'detector'])

@@ -16,15 +16,16 @@ from hand_pose_ros.detection import detect
 from hand_pose_ros.geometry import Cube, Intrinsics
 from hand_pose_ros.geometry import crop as crop_one
 from hand_pose_ros.skeleton import HAND21
-from hand_pose_ros.synthetic import benchmark, effects, sensors
+from hand_pose_ros.synthetic import benchmark, effects, scenes, sensors
 from hand_pose_ros.synthetic.crops import crop, settle
 from hand_pose_ros.synthetic.effects import Shot
 from hand_pose_ros.synthetic.generator import LEFT, SPLITS, SyntheticHands
-from hand_pose_ros.synthetic.renderer import View, plane
+from hand_pose_ros.synthetic.hand import HandModel
+from hand_pose_ros.synthetic.renderer import View, box, ellipsoid, plane, round_cone
 from hand_pose_ros.synthetic.rig import Rig
 from hand_pose_ros.synthetic.rng import Random
 from hand_pose_ros.synthetic.sensors import SENSORS
-from hand_pose_ros.synthetic.stages import Ingredients
+from hand_pose_ros.synthetic.stages import CUBE_SIDE, Ingredients, Stages
 
 CHUNK = 24  # smaller than by default: quick
 
@@ -323,6 +324,109 @@ def test_each_ingredient_can_be_left_out(without, batch):
     if without == 'detector':
         torch.testing.assert_close(plain['joints_m'].mean(1)[plain['hand_present']],
                                    plain['cube_center'][plain['hand_present']])
+
+
+# What else is there --------------------------------------------------------------------------------------------------
+
+@pytest.fixture(scope='module')
+def stage():
+    """400 scenes, as they stand before they are drawn."""
+    return Stages(Ingredients(), torch.arange(len(SENSORS)), HandModel(), torch.device('cpu')).build(torch.arange(400))
+
+
+def window(stage) -> View:
+    """48 x 48 pixels around each hand."""
+    view, _ = stage.window(stage.scene.joints.mean(1), torch.full((400,), CUBE_SIDE))
+    return View(view.fx / 3, view.fy / 3, (view.cx - 1) / 3, (view.cy - 1) / 3, 48, 48)
+
+
+def test_what_else_is_there_only_hides():
+    bare, full = (SyntheticHands('train', chunk=CHUNK, ingredients=Ingredients(
+        noise=False, detector=False, scenes=scenes)).batch(torch.arange(2 * CHUNK)) for scenes in (False, True))
+    assert torch.equal(bare['joints'], full['joints'])
+    assert (full['patch'] <= bare['patch'] + 1e-6).all()
+    assert not (full['visible'] & ~bare['visible']).any()
+    hidden = (bare['visible'] & ~full['visible']).sum() / bare['visible'].sum()
+    assert 0.002 < hidden < 0.1, 'most joints are not hidden by what else is there'
+
+
+def test_tables_walls_and_bodies_are_behind_hand_and_arm(stage):
+    scene = stage.scene
+    (plane_there,) = (solid for solid in scene.soft if solid.draw is plane)
+    normal, distance = plane_there.measures
+    beyond = (scene.vertices[plane_there.samples] @ normal[..., None])[..., 0].amax(1) - distance
+    assert beyond.max() < 1e-5 and 0.15 < (beyond > -1e-4).float().mean() < 0.5, 'some touch, none cuts'
+    tables = normal[:, 1] > 0.5
+    assert 0.1 < tables.float().mean() < 0.4 and not (normal[:, 1] < -0.8).any(), 'a table is below'
+    seated = [solid for solid in scene.soft if solid.draw is ellipsoid and scene.present[solid.samples].any()]
+    torso, head = seated
+    for solid in seated:
+        center, _, radii = solid.measures
+        assert (center[:, 2] - radii.amax(1) > scene.joints[solid.samples][..., 2].amax(1) - 0.25).all()
+    nearest = torso.measures[0][:, 2] - torso.measures[2][:, 2]
+    assert (nearest > scene.joints[torso.samples][..., 2].amax(1)).all()
+    assert (head.measures[0][:, 1] < torso.measures[0][:, 1] - 0.25).all(), 'heads up'
+
+
+def test_things_are_held_on_the_side_of_the_palm_and_lie_mostly_behind(stage):
+    scene = stage.scene
+    joints, held, before, behind = scene.joints, 0, 0, 0
+    palmar = torch.linalg.cross(joints[:, 5] - joints[:, 17], joints[:, 9] - joints[:, 0])
+    palm = joints[:, (0, 5, 9, 13, 17)].mean(1)
+    for number, solid in enumerate(scene.hard):
+        at, here = solid.balls.mean(1), solid.samples
+        if number < 3:
+            held += len(here)
+            assert (((at - palm[here]) * palmar[here]).sum(1) > 0).all()
+            assert ((at - palm[here]).norm(dim=1) < 0.12).all()
+        elif scene.present[here].any() and solid.draw in (ellipsoid, box):
+            center, _, size = solid.measures
+            near, far = joints[here][..., 2].aminmax(dim=1)
+            first = center[:, 2] + size.amax(1) < near
+            assert (first | (center[:, 2] - size.amax(1) > far)).all(), 'none runs through the hand'
+            assert (center[:, 2] - size.amax(1) > 0.1).all(), 'nor into the camera'
+            before, behind = before + int(first.sum()), behind + int((~first).sum())
+    assert 0.08 * 400 < held < 0.2 * 400
+    assert 5 < before < 0.3 * behind
+
+
+def test_sleeves_leave_the_hand_bare(stage):
+    scene = stage.scene
+    view = window(stage)
+    hand = scenes.splat(scene.joints[:, 3:], view) > 0
+    clothes = [solid for solid in scene.soft if solid.draw is round_cone and scene.present[solid.samples].any()]
+    covered = scenes.draw_solids(replace(scene, soft=clothes, hard=[], others=None), view) > 0
+    assert (covered & hand).sum() < 0.1 * hand.sum()
+    wrist = scenes.splat(scene.joints[:, :1], view) > 0
+    assert 0.05 < (covered & wrist).sum() / wrist.sum() < 0.5
+
+
+def test_most_images_without_a_hand_show_something_in_its_place(stage):
+    scene = stage.scene
+    absent = (~scene.present).nonzero()[:, 0]
+    assert 0.02 < len(absent) / 400 < 0.09
+    put = torch.cat([solid.samples for solid in scene.soft + scene.hard if not scene.present[solid.samples].any()])
+    assert 0.6 < len(put) / len(absent) <= 1 and set(put.tolist()) <= set(absent.tolist())
+
+
+def test_what_is_left_out_of_a_window_cannot_be_seen_in_it(stage):
+    scene = stage.scene
+    view = window(stage)
+    back = scene.joints.mean(1)[:, 2] + CUBE_SIDE / 2
+    whole, cut = scenes.draw_solids(scene, view), scenes.draw_solids(scene, view, back)
+    seen = whole > 1 / back[:, None, None]
+    assert torch.equal(whole[seen], cut[seen]) and (cut != whole).any()
+
+
+def test_second_hands_are_beside_the_first_and_mostly_left(stage):
+    others = stage.scene.others
+    assert 0.04 < len(others.samples) / 400 < 0.13 and 0.5 < others.left.float().mean() < 0.9
+    a, b, c = (others.vertices[:, corner].double() for corner in HandModel().faces.T)
+    volume = (a * torch.linalg.cross(b, c)).sum((1, 2))
+    assert torch.equal(volume < 0, others.left), 'the skin of a left hand is mirrored'
+    hand = others.vertices[:, HandModel().vertex_part != 6].mean(1)
+    apart = (hand - stage.scene.joints[others.samples].mean(1)).norm(dim=1)
+    assert apart.min() > 0.06 and apart.max() < 0.4
 
 
 def test_full_frame_and_moving_hand():

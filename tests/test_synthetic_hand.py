@@ -1,7 +1,7 @@
 """The synthetic hand: joints exact, skin closed and around the bones, shapes as measured, poses as hands move."""
 
 import math
-from itertools import pairwise
+from itertools import combinations, pairwise, product
 
 import numpy as np
 import pytest
@@ -236,9 +236,27 @@ def test_overlaps_are_seen():
     """A finger straight through the palm, and two fingers crossing, are reported as deep as they are."""
     through = overlaps(pose(**OPEN, middle_mcp_flexion=92, middle_pip_flexion=130, middle_dip_flexion=60))
     assert through[0, 2, 5] > 0.002
+    thumb = overlaps(pose(**OPEN | {'thumb_cmc_radial': 0, 'thumb_cmc_palmar': -10}))
+    assert thumb[0, 0, 5] > 0.002
     crossed = overlaps(pose(**OPEN, index_mcp_abduction=-14, middle_mcp_abduction=14))
     assert crossed[0, 1, 2] > 0.004
     assert overlaps(pose(**OPEN, index_mcp_abduction=20, ring_mcp_abduction=15, pinky_mcp_abduction=30)).max() == 0
+
+
+def test_bones_of_different_digits_keep_their_flesh_apart():
+    """Told from the joints alone; fingers may touch where they grow together."""
+    shape = mean_shape()
+    joints = forward(shape, sample_poses(Random(torch.arange(600))), torch.zeros(len(POSE)))[2]
+    digits = joints[:, 1:].reshape(-1, 5, 4, 3)
+    along = torch.linspace(0, 1, 9)[:, None]
+    bones = digits[:, :, :3, None] * (1 - along) + digits[:, :, 1:, None] * along  # (B, 5, 3, 9, 3)
+    for a, b in combinations(range(5), 2):
+        for i, j in product(range(3), repeat=2):
+            if i == 0 if a == 0 else i + j == 0:
+                continue
+            apart = torch.cdist(bones[:, a, i], bones[:, b, j]).amin((1, 2))
+            deep = 0.93 * (shape.radii[0, a, i] + shape.radii[0, b, j]) - apart
+            assert deep.max() < (0.0025 if a == 0 else 0.005), (a, i, b, j)
 
 
 def test_fingers_spread_and_thumbs_stand_off_as_far_as_real_ones(model):

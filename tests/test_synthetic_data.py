@@ -427,6 +427,11 @@ def test_second_hands_are_beside_the_first_and_mostly_left(stage):
     hand = others.vertices[:, HandModel().vertex_part != 6].mean(1)
     apart = (hand - stage.scene.joints[others.samples].mean(1)).norm(dim=1)
     assert apart.min() > 0.06 and apart.max() < 0.4
+    view, alone = window(stage), HandModel()
+    image, own = Stages(Ingredients(), torch.arange(len(SENSORS)), alone, torch.device('cpu')).draw(stage, view)
+    first, second = scenes.draw_hands(stage.scene, alone.faces, view)
+    assert torch.equal(own, first), 'joints are not visible for the skin of another hand'
+    assert second.any() and (image >= second).all()
 
 
 def test_full_frame_and_moving_hand():

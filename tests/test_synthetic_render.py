@@ -152,6 +152,9 @@ def test_mesh_that_reaches_the_camera_is_drawn_as_far_as_a_sensor_sees():
         image = rasterise(arm, faces, v)
         assert torch.equal(image, rasterise(arm, faces[far], v))
         assert image.any() and depth_of(image)[image > 0].min() > renderer.NEAR
+    floor = torch.tensor([[[-0.1, 0.05, 0.4], [0.1, 0.05, 0.4], [0.0, 0.05, -0.2]]])
+    for faces in torch.tensor([[0, 1, 2]]), torch.tensor([[0, 2, 1]]):
+        assert not rasterise(floor, faces, v).any(), 'nor with a corner behind the camera'
 
 
 def test_plane_is_exact():

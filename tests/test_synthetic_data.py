@@ -265,9 +265,9 @@ def test_noise_has_the_measured_size_and_does_not_shift_surfaces():
     # In a window where every other pixel is left out, those that remain are as they were.
     for scale, (normal, tangent) in product((1.0, 0.5), (([0, 0, 1], 0), ([2, 0, 1], 2), ([0, 2, 1], 2))):
         v = View(*(torch.tensor([t]) for t in (364.5 * scale, 364.5 * scale, 60.0, 30.0)), 60, 120)
-        image = plane(torch.tensor([normal]).float(), torch.tensor([1.0]), v).expand(40, -1, -1)
+        image = plane(torch.tensor([normal]).float(), torch.tensor([0.6]), v).expand(40, -1, -1)
         off = (1 / effects.tof_noise(image, _shot(40, 'kinect2', scale=scale)) - 1 / image)[:, 25:36, 55:66]
-        sigma = (1.5 - 0.5 + 0.3 + 0.1 * tangent ** 2) * 1e-3 * 1.3  # Fankhauser 2015 at 1 m, times that of the sensor
+        sigma = (1.5 - 0.3 + 0.108 + 0.0465 * tangent ** 2) * 1.3e-3  # Fankhauser 2015 at 0.6 m, times the sensor's
         assert off.std() == pytest.approx(sigma, rel=0.1) and off.mean().abs() < sigma / 5
     image = torch.linspace(1 / 0.6, 1 / 0.65, 120).expand(20, 60, 120)
     for scale in (1.0, 0.5):

@@ -1,5 +1,6 @@
 """What `replay` promises: a bag on ROS topics as it was recorded. The real node, over real DDS."""
 
+import os
 import time
 from types import SimpleNamespace
 
@@ -12,6 +13,8 @@ pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
 from rosbags.interfaces import QosReliability  # noqa: E402
+from rosbags.rosbag1 import Writer as Writer1  # noqa: E402
+from rosbags.typesys import Stores, get_typestore  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
 from sensor_msgs.msg import CameraInfo, Image  # noqa: E402
 from std_srvs.srv import SetBool  # noqa: E402
@@ -22,6 +25,7 @@ from hand_pose_ros.cli import main  # noqa: E402
 from hand_pose_ros.depth import decode_image  # noqa: E402
 from hand_pose_ros.errors import InputError  # noqa: E402
 from hand_pose_ros.msg import HandJointsArray, HandSkeleton  # noqa: E402
+from hand_pose_ros.ros import qos  # noqa: E402
 from hand_pose_ros.ros.replay import SETTLE_S, Replay  # noqa: E402
 from hand_pose_ros.skeleton import HAND21  # noqa: E402
 
@@ -119,6 +123,25 @@ def test_ros1_bags_become_ros2_messages(tmp_path, depths, listener, play):
     assert infos[0].k[0] == CAMERA.fx and infos[0].p[5] == CAMERA.fy and infos[0].width == 64
 
 
+def test_what_is_latched_in_a_ros1_bag_stays_so_and_what_is_unknown_is_left_out(tmp_path, listener, play, capfd):
+    store, kind = get_typestore(Stores.ROS1_NOETIC), 'rosgraph_msgs/msg/Clock'
+    with Writer1(tmp_path / 'old.bag') as bag:
+        still = bag.add_connection('/still', kind, typestore=store, latching=1)
+        clock, _ = (bag.add_connection(topic, kind, typestore=store) for topic in ('/clock', '/empty'))
+        other = bag.add_connection('/other', 'nobody_msgs/msg/Thing', msgdef='int8 x\n',
+                                   md5sum='6b7838fc0c9ab0287a0bf785874d405b')
+        for connection, data in ((still, bytes(8)), (clock, bytes(8)), (other, bytes(1))):
+            bag.write(connection, STAMPS[0], data)
+    replay = play(tmp_path / 'old.bag', clock=True)
+    assert '/other is left out: ' in capfd.readouterr().err
+    replay.play()
+    assert replay.published == {'/still': 1}  # the clock is that of the replay
+    listener.on('/still', Clock, LATCHED)
+    assert listener.until(lambda: listener.heard['/still'])
+    with pytest.raises(InputError, match='there is nothing to publish'):
+        play(tmp_path / 'old.bag', topics=[])
+
+
 def test_the_latched_skeleton_reaches_who_comes_later(bag, listener, play):
     replay = play(bag, topics=['/hand/skeleton'])
     replay.wait_for_subscribers(0)
@@ -137,12 +160,14 @@ def test_what_was_latched_before_the_start_reaches_everybody(listener, play, tmp
             writer.write_hands(stamp, 'camera', [])
     everything = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     listener.on('/hand/skeleton', HandSkeleton, everything).on('/hand/joints', HandJointsArray)
-    replay = play(path)
+    listener.on('/clock', Clock)
+    replay = play(path, clock=True)
     replay.wait_for_subscribers(10, number=2)
     replay.play(start_s=0.264)
     early, hands = listener.heard['/hand/skeleton'], listener.heard['/hand/joints']
     assert listener.until(lambda: len(early) == 30 and len(hands) == 4)
     assert stamps(hands) == STAMPS[8:]
+    assert all(m.clock.sec * 10**9 + m.clock.nanosec >= STAMPS[8] for m in listener.heard['/clock'])
     listener.on('/hand/skeleton', HandSkeleton, everything)
     late = listener.heard['/hand/skeleton']
     assert listener.until(lambda: len(late) == 30)
@@ -164,19 +189,31 @@ def test_start_rate_and_topics(bag, listener, play):
         replay.play(start_s=99)
 
 
-def test_the_clock_tells_the_time_of_recording(bag, listener, play):
-    listener.on('/clock', Clock).on('/depth/image_rect', Image)
-    replay = play(bag, clock=True, rate=0.5)
+def test_the_clock_tells_the_time_of_recording(bag, listener, play, monkeypatch):
+    monkeypatch.setattr('hand_pose_ros.ros.replay.CLOCK_PERIOD_S', 0.01)
+    listener.on('/clock', Clock, 1000).on('/depth/image_rect', Image)
+    replay = play(bag, clock=True, rate=0.25)
     replay.wait_for_subscribers(10, number=1)
     replay.play()
     assert listener.until(lambda: len(listener.heard['/depth/image_rect']) == len(STAMPS))
-    listener.until(lambda: False, seconds=0.2)
-    times = [m.clock.sec * 10**9 + m.clock.nanosec for m in listener.heard['/clock']]
-    assert len(times) >= len(STAMPS) and times == sorted(times)
-    assert STAMPS[0] <= times[0] and times[-1] == STAMPS[-1]
+
+    def times():
+        return [m.clock.sec * 10**9 + m.clock.nanosec for m in listener.heard['/clock']]
+    assert listener.until(lambda: times()[-1:] == STAMPS[-1:])
+    assert len(set(times())) > 30, 'it goes on between two messages'
+    assert times() == sorted(times()) and times()[0] >= STAMPS[0]
 
 
-def test_pause_by_service(bag, listener, play):
+@pytest.fixture
+def pass_time(monkeypatch):
+    """Let so many seconds pass for the replay."""
+    passed = []
+    monkeypatch.setattr('hand_pose_ros.ros.replay.time', SimpleNamespace(
+        monotonic=lambda: time.monotonic() + sum(passed), sleep=time.sleep))
+    return passed.append
+
+
+def test_pause_by_service(bag, listener, play, pass_time):
     replay = play(bag, paused=True, topics=['/depth/image_rect'], rate=10)
     client = listener.node.create_client(SetBool, '/replay/pause')
     answer = []
@@ -184,12 +221,32 @@ def test_pause_by_service(bag, listener, play):
     def go_on():
         # Played from within the loop of the replay, which waits: the timer stands for another terminal.
         if client.service_is_ready() and not answer:
+            pass_time(3600)
             answer.append(client.call_async(SetBool.Request(data=False)))
     replay.node.create_timer(0.3, go_on)
     began = time.monotonic()
     replay.play()
     assert time.monotonic() - began >= 0.25 and replay.published['/depth/image_rect'] == 12
+    assert replay.lateness_s < 1800, 'the time of the bag stands still in a pause'
     assert listener.until(lambda: answer[0].done()) and answer[0].result().message == 'playing'
+
+
+def test_the_time_of_the_bag_stands_still_until_the_listener_is_ready(bag, listener, play, pass_time):
+    replay, asked = play(bag, topics=['/depth/image_rect'], rate=10), []
+
+    def ready():
+        asked.append(len(asked))
+        pass_time(1)
+        return len(asked) % 2 == 0  # only when it is asked again
+    replay.play(ready=ready)
+    assert len(asked) == 2 * len(STAMPS) and replay.lateness_s < 12
+
+
+def test_what_came_late_is_told(bag, listener, play, pass_time):
+    replay = play(bag)
+    delay = replay.node.create_timer(0, lambda: (pass_time(0.2), delay.cancel()))
+    replay.play()
+    assert replay.lateness_s > 0.1
 
 
 def test_best_effort_on_request(bag, listener, play):
@@ -215,12 +272,17 @@ def test_topics_that_are_not_there_are_named(bag, listener, play):
         play(bag, topics=['/depth/imaje'])
 
 
-def test_the_command_publishes_and_counts(bag, ros_domain, capsys):
+def test_the_command_publishes_and_counts(bag, ros_domain, capsys, monkeypatch):
+    for name in qos.PROFILE_VARIABLES:
+        monkeypatch.setenv(name, '')  # to be as it was after the test
+        monkeypatch.delenv(name)
     assert main(['replay', str(bag), '--rate', '100', '--wait', '0', '--ros-args', '-r', '__ns:=/robot',
                  '-r', '/depth/image_rect:=/front/depth']) == 0
     said = capsys.readouterr().out
     assert 'publishing /depth/camera_info, /front/depth, /' in said and '12  /front/depth' in said
     assert '/depth/image_rect' not in said
+    name, profile = qos.large_image_profile()
+    assert os.environ[name] == profile, 'large images get through'
     assert main(['replay', str(bag.with_name('missing.bag'))]) == 1
     assert 'missing.bag: there is no such bag' in capsys.readouterr().err
     for option, value in (('--rate', '0'), ('--start', '-1'), ('--start', 'nan'), ('--start', 'inf'),

@@ -418,9 +418,9 @@ def test_a_wrong_override_is_one_sentence(override, message):
 # Runs
 
 def test_training_learns_and_leaves_a_folder_that_tells_all(folder, tmp_path, monkeypatch):
-    monkeypatch.setattr('hand_pose_ros.training.loop.TOLD_EVERY_S', 0)
     run = tiny(folder, 'network=deep', 'optimizer=adamw', 'learning_rate=0.002', 'samples=960', 'batch_size=16',
                'val_every=480', 'options.dropout=0.0', recipe='paper', out=tmp_path)
+    monkeypatch.setattr('hand_pose_ros.training.loop.time', SimpleNamespace(monotonic=lambda: 2 * run.step))
     first = run.train()
     # Twelve frames do not tell where scattered balls are in a new one, but those it was shown it knows.
     shown = load_checkpoint(tmp_path / 'last.safetensors')
@@ -432,11 +432,12 @@ def test_training_learns_and_leaves_a_folder_that_tells_all(folder, tmp_path, mo
         'skeleton': 'icvl16', 'cube_side': 0.25, 'training_data': 'icvl-train'}
     lines = [json.loads(line) for line in (tmp_path / 'metrics.jsonl').read_text().splitlines()]
     assert [line['samples'] for line in lines if 'val_mm' in line] == [480, 960]
-    assert [line['step'] for line in lines if 'joints' in line] == [50, 60]
+    assert [(line['step'], line['rate']) for line in lines if 'joints' in line] == [(50, 8), (60, 8)]
     config = json.loads((tmp_path / 'config.json').read_text())
     assert recipe_from_dict(config['recipe']) == run.recipe and 'git' in config
     assert (tmp_path / 'best.safetensors').exists()
-    assert ' of 960 samples, ' in (tmp_path / 'log.txt').read_text()  # how it goes, where no terminal shows a bar
+    told = (tmp_path / 'log.txt').read_text().count(' of 960 samples, ')  # how it goes, where no terminal shows a bar
+    assert told == 1, 'a line a minute'
     with pytest.raises(TrainingError, match='holds a run already'):
         tiny(folder, out=tmp_path).train()
 
@@ -497,12 +498,14 @@ def test_a_stopped_run_continues_bit_for_bit(folder, tmp_path, recipe):
     again = tiny(folder, *overrides, recipe=recipe, out=tmp_path / 'stopped')
     again.train(resume=True)
     assert same_state(tmp_path / 'whole', tmp_path / 'stopped')
-    assert [json.loads(line)['step'] for line in metrics.read_text().splitlines()] == [3, 10, 10]
+    *rows, last, _ = map(json.loads, metrics.read_text().splitlines())
+    assert [row['step'] for row in rows] == [3] and last['step'] == 10
+    assert last['learning_rate'] == learning_rate(run.recipe, 9 / 10)
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
 def test_what_is_validated_and_shipped_is_the_average_of_the_weights_and_of_what_norms_have_seen(folder, tmp_path):
-    run = tiny(folder, *MODERN, 'samples=12', 'learning_rate=0.1', 'warmup=0', 'average=0.15', recipe='modern',
+    run = tiny(folder, *MODERN, 'samples=11', 'learning_rate=0.1', 'warmup=0', 'average=0.15', recipe='modern',
                out=tmp_path)
     expected, train_step = copy.deepcopy(run.objective.network.state_dict()), run._train_step
 
@@ -515,6 +518,7 @@ def test_what_is_validated_and_shipped_is_the_average_of_the_weights_and_of_what
         return terms
     run._train_step = watched
     run.train()
+    assert run.step == 3, 'samples are asked for, at least so many'
     shipped = load_checkpoint(tmp_path / 'last.safetensors').network.state_dict()
     last = run.objective.network.state_dict()
     for name, value in expected.items():
@@ -586,8 +590,9 @@ def test_ctrl_c_before_the_first_step_ends_a_run_at_once(tmp_path, width):
 
 
 def test_a_signal_does_not_wait_for_samples_and_the_run_continues_bit_for_bit(folder, tmp_path):
-    tiny(folder, 'samples=40', out=tmp_path / 'whole').train()
-    run = tiny(folder, 'samples=40', out=tmp_path / 'stopped')
+    overrides = ('samples=40', 'val_every=28')
+    tiny(folder, *overrides, out=tmp_path / 'whole').train()
+    run = tiny(folder, *overrides, out=tmp_path / 'stopped')
     batch = run.stream.batch
 
     def endless(step):
@@ -598,8 +603,21 @@ def test_a_signal_does_not_wait_for_samples_and_the_run_continues_bit_for_bit(fo
     run.stream.batch = endless
     with pytest.raises(TrainingError, match=r'after 28 samples, with .*last.safetensors; .* --resume goes on'):
         run.train()
-    tiny(folder, 'samples=40', out=tmp_path / 'stopped').train(resume=True)
+    assert 'val_mm' in load_checkpoint(tmp_path / 'stopped' / 'last.safetensors').metadata['validation']
+    tiny(folder, *overrides, out=tmp_path / 'stopped').train(resume=True)
     assert same_state(tmp_path / 'whole', tmp_path / 'stopped')
+    assert validations(tmp_path / 'stopped') == validations(tmp_path / 'whole')
+    logs = [(tmp_path / name / 'log.txt').read_text() for name in ('whole', 'stopped')]
+    assert [log.count('the recipe is in') for log in logs] == [1, 2], 'each has a log of its own'
+
+
+def test_the_state_is_saved_now_and_then_and_around_a_validation(folder, tmp_path, monkeypatch):
+    run, saved = None, []
+    monkeypatch.setattr('hand_pose_ros.training.loop.time', SimpleNamespace(monotonic=lambda: run.step if run else 0))
+    monkeypatch.setattr('hand_pose_ros.training.loop.save_state', lambda *_: saved.append(run.step))
+    run = tiny(folder, 'samples=40', out=tmp_path, save_every_s=3)
+    run.train()
+    assert saved == [4, 8, 10, 10]
 
 
 def test_what_a_killed_run_left_half_written_goes_with_the_next(tmp_path):
@@ -652,7 +670,9 @@ def test_a_full_disk_is_told_of_with_the_file(tmp_path, monkeypatch):
 
 
 def test_a_run_that_was_stopped_in_its_last_validation_does_it_when_resumed(folder, tmp_path):
-    expected = tiny(folder, 'samples=40', out=tmp_path / 'whole').train()
+    whole = tiny(folder, 'samples=40', out=tmp_path / 'whole')
+    stop_after(whole, 10)  # in its last step: nothing is left to stop
+    expected = whole.train()
     run = tiny(folder, 'samples=40', out=tmp_path / 'stopped')
 
     def stopped():
@@ -756,6 +776,17 @@ def test_two_processes_give_the_result_of_one(folder, tmp_path):
     one, two = (load_file(tmp_path / name / 'state.safetensors') for name in ('one', 'two'))
     for key, value in one.items():
         torch.testing.assert_close(two[key], value, atol=1e-5, rtol=1e-4)
+
+
+def test_a_batch_that_cannot_be_shared_is_refused(folder, tmp_path, monkeypatch):
+    monkeypatch.setenv('WORLD_SIZE', '3')
+    with pytest.raises(TrainingError, match='a batch of 4 cannot be shared equally by 3 processes'):
+        tiny(folder, out=tmp_path)
+
+
+def test_epochs_are_of_the_samples_and_threads_as_many_as_asked(folder, tmp_path):
+    run = tiny(folder, 'samples=none', 'epochs=3', out=tmp_path, threads=2)
+    assert run.budget == 3 * 16 and torch.get_num_threads() == 2
 
 
 def test_a_device_that_is_not_there_is_told_before_the_work(folder, tmp_path):
@@ -1044,6 +1075,14 @@ def test_experiments_train_what_is_missing_and_write_table_plot_and_json(folder,
     assert [result['name'] for result in results] == [
         'deep-30', 'deep-30 + std_ref x1', 'deep-30 + std_ref x2', 'deep-30 + or_ref x1', 'deep-30 + or_ref x2']
     assert len({result['mean_mm'] for result in results}) == 5 and all(result['frames'] == 6 for result in results)
+    told = {name: json.loads((tmp_path / f'{name}.json').read_text()) for name in ('joints', 'runtime')}
+    twice = told['joints']['results'][2]
+    assert twice['name'] == 'deep-30 + or_ref x2' and twice['mean_mm'] == pytest.approx(results[4]['mean_mm'])
+    within = ''.join(f' {100 * twice["within_mm"][mm]:.1f} % |' for mm in ('20', '30', '40', '80'))
+    assert (tmp_path / 'joints.md').read_text().splitlines()[-1] == (
+        f'| deep-30 + or_ref x2 | {twice["mean_mm"]:.2f} | {twice["median_mm"]:.2f} |{within}')
+    slow, fast = (told['runtime']['rows'][f'deep|{way}']['p50_ms'] for way in ('eager', 'fast'))
+    assert f'| deep | 0.1 | 2.08 | {slow:.2f} | {fast:.2f} |' in (tmp_path / 'runtime.md').read_text()
 
     monkeypatch.chdir(tmp_path)
     arguments[1] = str(tmp_path)
@@ -1056,7 +1095,9 @@ def test_experiments_train_what_is_missing_and_write_table_plot_and_json(folder,
 def test_an_experiment_that_leaves_nothing_for_the_refiner_is_refused_at_once(folder, tmp_path, capsys):
     sets = [part for item in (*TINY, f'root={folder}', 'samples=24') for part in ('--set', item)]
     assert main(['experiment', 'joints', '--out', str(tmp_path), '--workers', '0', *sets]) == 1
-    assert 'for example with --set last_shard=' in capsys.readouterr().err
+    assert 'some of the 4 shards of icvl-train, for example with --set last_shard=3' in capsys.readouterr().err
+    assert main(['experiment', 'ingredients', '--out', str(tmp_path), '--workers', '0', *sets]) == 1
+    assert '--set dataset=icvl: only synthetic hands have ingredients to leave out' in capsys.readouterr().err
     assert not (tmp_path / 'runs').exists()
 
 

@@ -75,6 +75,19 @@ def test_a_gpu_that_this_pytorch_cannot_use(weights: Path, monkeypatch: pytest.M
         assert report(capsys)[1]['device'] == [f'ok: cuda graph on {told}'], 'one GPU is used, not all'
 
 
+def test_a_gpu_that_pytorch_does_not_see_and_a_check_that_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr('torch.cuda.device_count', lambda: 0)
+    monkeypatch.setattr(doctor.shutil, 'which', {'nvidia-smi': '/usr/bin/nvidia-smi'}.get)
+    (_, first), (level, text) = doctor.CHECKS['device']()
+    assert first.startswith('onnxruntime on the CPU') and level == 'note' and 'sees no GPU: install a PyTorch' in text
+
+    def broken(_: str) -> None:
+        raise RuntimeError('no kernels')
+    monkeypatch.setattr('hand_pose_ros.models.build', broken)
+    assert list(doctor._examine(doctor.CHECKS['device'])) == [
+        ('WRONG', 'cannot be used (RuntimeError: no kernels): reinstall the package')]
+
+
 def test_missing_and_damaged_weights(weights: Path, monkeypatch: pytest.MonkeyPatch,
                                      capsys: pytest.CaptureFixture[str]) -> None:
     with monkeypatch.context() as patch:
@@ -107,7 +120,7 @@ def test_an_environment_in_which_no_node_starts(name: str, value: str, weights: 
     monkeypatch.setenv(name, value)
     code, about = report(capsys)
     assert code == 1 and about['ROS 2'][0].startswith('WRONG: no node can be started')
-    assert f'{name}={value}' in about['ROS 2'][0]
+    assert f'{name}={value}' in about['ROS 2'][0] and 'DDS profile' not in about
 
 
 def test_a_library_that_cannot_be_imported(weights: Path, monkeypatch: pytest.MonkeyPatch,
@@ -143,6 +156,10 @@ def test_profiles_of_the_middleware(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     small.write_text(PROFILE.read_text().replace('16777216', '524288'))
     monkeypatch.setenv(ours, str(small))
     assert lines()[0].startswith('note') and '512 kB, too small' in lines()[0]
+    small.write_text('<profiles/>')  # that says nothing of segments
+    assert lines()[0].startswith('note') and '512 kB, too small' in lines()[0]
+    monkeypatch.setattr('hand_pose_ros.ros.qos.middleware', lambda: 'rmw_cyclonedds_cpp')
+    assert lines() == ['ok: not needed with rmw_cyclonedds_cpp']
 
 
 @pytest.mark.parametrize('distro, version, name', [
@@ -159,10 +176,15 @@ def test_the_variable_is_that_of_the_release_from_wheels_too(distro: str | None,
     assert qos.large_image_profile()[0] == name
 
 
-def test_too_little_shared_memory(weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-                                  capsys: pytest.CaptureFixture[str]) -> None:
+def test_shared_memory_that_is_too_little_or_of_another_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip('rclpy', reason='needs ROS 2')
     monkeypatch.setattr(doctor, 'SHARED_MEMORY', tmp_path)
+    monkeypatch.setattr(doctor, 'ENOUGH_SHARED_MEMORY', 0)
+    (tmp_path / 'fastrtps_port7411').touch()
+    [(level, text)] = doctor.CHECKS['shared memory']()
+    assert level == 'ok' and text.endswith(f'MB free in {tmp_path}')
+    monkeypatch.setattr(doctor.os, 'access', lambda *_: False)
     monkeypatch.setattr(doctor, 'ENOUGH_SHARED_MEMORY', 1 << 60)
-    code, about = report(capsys)
-    assert code == 1 and 'too little for large images' in about['shared memory'][0]
+    (first, small), (second, foreign) = doctor.CHECKS['shared memory']()
+    assert first == second == 'WRONG' and 'too little for large images' in small
+    assert foreign.startswith('1 segments of Fast DDS there belong to another user')

@@ -44,6 +44,9 @@ def test_a_bag(tmp_path, bag, depths, weights):
     for image, depth in zip(images.values(), depths, strict=True):
         millimetres = np.frombuffer(bytes(np.array(image, np.uint8)), np.uint16).reshape(depth.shape)
         np.testing.assert_allclose(millimetres * 0.001, depth, atol=0.00051)
+    assert set(map(tuple, recorded(out, '/camera/depth', 'DepthImage:meter').values())) == {(1000,)}
+    [[size]] = list(recorded(out, '/camera', 'Pinhole:resolution').values())[:1]
+    assert tuple(size) == (160, 120)
     [[matrix]] = list(recorded(out, '/camera', 'Pinhole:image_from_camera').values())[:1]
     np.testing.assert_allclose(np.array(matrix).reshape(3, 3).T, [[140, 0, 80], [0, 140, 60], [0, 0, 1]])
     estimator = HandPoseEstimator.from_pretrained(weights, min_score=0.0, side='left')
@@ -88,6 +91,11 @@ def test_a_failure_leaves_no_file_and_is_one_sentence(tmp_path, bag, weights, ca
         writer.write_depth(STAMPS[0], 'camera', np.zeros((60, 160), np.float32), CAMERA)  # another size than it says
     assert main(['view', str(tmp_path / 'bad.mcap'), '--model', str(weights), '--save', str(tmp_path / 'a.rrd')]) == 1
     assert 'none of its images could be used' in capsys.readouterr().err
+    monkeypatch.setattr(sys, 'platform', 'linux')
+    for name in ('DISPLAY', 'WAYLAND_DISPLAY'):
+        monkeypatch.delenv(name, raising=False)
+    assert main(['view', str(bag), '--model', str(weights)]) == 1
+    assert 'there is no display for the viewer: write a file with --save' in capsys.readouterr().err
     monkeypatch.setitem(sys.modules, 'rerun', None)
     monkeypatch.setenv('DISPLAY', ':0')
     assert main(['view', str(bag), '--model', str(weights)]) == 1

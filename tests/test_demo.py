@@ -65,10 +65,14 @@ def test_the_demo_leaves_pictures_and_numbers(tmp_path: Path, weights: Path, ros
     assert 0 < summary['latency_p50_ms'] <= summary['latency_p99_ms']
     if summary['frames_with_a_hand']:  # an untrained network may not be sure enough
         assert 0 < summary['joint_error_mean_mm'] < 300
-    assert cv2.imread(str(out / 'sheet.png')).shape[0] >= 320
+    sheet = cv2.imread(str(out / 'sheet.png'))
+    assert sheet.shape[0] == 2 * 320  # three in a row
     from PIL import Image
     with Image.open(out / 'animation.webp') as animation:
         assert animation.n_frames > 1
+        first = np.array(animation.convert('RGB'))[..., ::-1]
+        assert animation.info['duration'] == 40  # as fast as it was recorded
+    assert np.abs(first[:, :400].astype(int) - sheet[:320, :400]).mean() < 5  # and in the same colours
     said = capfd.readouterr().out
     assert 'frames answered' in said and 'latency p99 ms' in said
 

@@ -525,6 +525,15 @@ def test_command_line_shows_writes_and_measures(tmp_path, capsys, shared_data):
     assert picture is not None and picture.std() > 20
     assert main(['synth', 'show', str(tmp_path / 'new' / 'sheet.png'), '--number', '1']) == 0
     assert (tmp_path / 'new' / 'sheet.png').exists()
+    two, second, clean, joints = (tmp_path / f'{name}.png' for name in ('two', 'second', 'clean', 'joints'))
+    for file, *options in ((two, '--number', '2'), (second, '--start', '1', '--number', '1'),
+                           (clean, '--number', '2', '--clean'), (joints, '--number', '2', '--joints')):
+        assert main(['synth', 'show', str(file), '--split', 'val', '--sensors', 'd435', *options]) == 0
+    noisy, one, perfect, drawn = (cv2.imread(str(file)).astype(int) for file in (two, second, clean, joints))
+    np.testing.assert_array_equal(one, noisy[:, 256:])
+    rough, smooth = (np.abs(np.diff(picture[20:], axis=0)).mean() for picture in (noisy, perfect))
+    assert smooth < 0.7 * rough
+    assert (np.ptp(drawn, axis=2) > 0).any() and not np.ptp(noisy, axis=2).any()  # joints are all that is coloured
 
     assert main(['synth', 'record', str(tmp_path / 'raw.mcap'), '--number', '2', '--raw']) == 0
     with DepthBag(tmp_path / 'raw.mcap') as bag:
@@ -537,11 +546,12 @@ def test_command_line_shows_writes_and_measures(tmp_path, capsys, shared_data):
             np.testing.assert_allclose(image.depth, depth, atol=0.00051)
             np.testing.assert_allclose(hand.joints[0], joints, atol=1e-6)
     assert main(['synth', 'write', str(tmp_path / 'data'), '--number', '5', '--shard', '3', '--split', 'val', '--start',
-                 '0']) == 0
+                 '1']) == 0
     shards = sorted((tmp_path / 'data').iterdir())
-    assert [shard.name for shard in shards] == ['val_000000000.npz', 'val_000000003.npz']
+    assert [shard.name for shard in shards] == ['val_000000001.npz', 'val_000000004.npz']
     with np.load(shards[1]) as shard:
-        expected = SyntheticHands('val').batch(torch.tensor([3, 4]))
+        expected = SyntheticHands('val').batch(torch.tensor([4, 5]))
+        assert shard['index'].tolist() == [4, 5]
         np.testing.assert_array_equal(shard['joints'], expected['joints'].numpy())
         np.testing.assert_allclose(shard['patch'], expected['patch'].numpy(), atol=5e-4)
 

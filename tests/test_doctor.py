@@ -76,6 +76,7 @@ def test_a_gpu_that_this_pytorch_cannot_use(weights: Path, monkeypatch: pytest.M
 
 
 def test_a_gpu_that_pytorch_does_not_see_and_a_check_that_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr('torch.cuda.is_available', lambda: False)
     monkeypatch.setattr('torch.cuda.device_count', lambda: 0)
     monkeypatch.setattr(doctor.shutil, 'which', {'nvidia-smi': '/usr/bin/nvidia-smi'}.get)
     (_, first), (level, text) = doctor.CHECKS['device']()

@@ -200,7 +200,7 @@ def test_the_clock_tells_the_time_of_recording(bag, listener, play, monkeypatch)
     def times():
         return [m.clock.sec * 10**9 + m.clock.nanosec for m in listener.heard['/clock']]
     assert listener.until(lambda: times()[-1:] == STAMPS[-1:])
-    assert len(set(times())) > 30, 'it goes on between two messages'
+    assert len(set(times())) > len(STAMPS), 'it goes on between two messages'
     assert times() == sorted(times()) and times()[0] >= STAMPS[0]
 
 

@@ -33,7 +33,7 @@ from hand_pose_ros.ros import qos
 WIDTH, HEIGHT, FOCAL = 640, 480, 570.0
 PROFILES = {'none': (False, False), 'camera': (True, False), 'node': (False, True), 'both': (True, True)}
 """Which processes have the profile: (camera, node)."""
-COMMAND = [sys.executable, '-c', 'import sys; from hand_pose_ros.cli import main; sys.exit(main())']
+COMMAND = [sys.executable, '-m', 'hand_pose_ros.cli']
 WARM_UP = 15
 """Images that are published first and do not count."""
 

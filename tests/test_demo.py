@@ -153,9 +153,8 @@ def test_an_image_that_cannot_be_decoded_is_left_out_of_the_pictures(monkeypatch
 
 
 def test_ctrl_c_is_one_sentence(ros_domain: int, tmp_path: Path) -> None:
-    code = 'import sys; from hand_pose_ros.cli import main; sys.exit(main())'
-    with subprocess.Popen([sys.executable, '-c', code, 'demo', '--out', str(tmp_path)], stdout=subprocess.PIPE,
-                          stderr=subprocess.STDOUT, text=True) as process:
+    command = [sys.executable, '-m', 'hand_pose_ros.cli', 'demo', '--out', str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         next(line for line in process.stdout if 'listening to' in line)
         process.send_signal(signal.SIGINT)
         # ROS itself may tell that it could not publish that line any more.

@@ -342,10 +342,9 @@ def test_processes_of_torchrun_share_the_bags(tmp_path, bag, model):
     with socket.socket() as free:
         free.bind(('127.0.0.1', 0))
         port = free.getsockname()[1]
-    code = 'import sys; from hand_pose_ros.cli import main; sys.exit(main())'
     processes = [subprocess.Popen(
-        [sys.executable, '-c', code, 'evaluate', str(bag), str(other), '--model', model, '--device', 'cpu',
-         '--min-score', '0', '--json', str(tmp_path / f'{rank}.json')],
+        [sys.executable, '-m', 'hand_pose_ros.cli', 'evaluate', str(bag), str(other), '--model', model, '--device',
+         'cpu', '--min-score', '0', '--json', str(tmp_path / f'{rank}.json')],
         env={**os.environ, 'RANK': str(rank), 'WORLD_SIZE': '2', 'LOCAL_WORLD_SIZE': '2', 'MASTER_ADDR': '127.0.0.1',
              'MASTER_PORT': str(port)}) for rank in range(2)]
     assert [process.wait(timeout=100) for process in processes] == [0, 0]
@@ -412,10 +411,9 @@ def test_processes_that_evaluate_end_with_the_one_that_started_them_and_leave_no
         for k in range(1500):
             for connection, time_ns, data in messages:
                 writer.write_serialized(connection.topic, connection.msgtype, data, time_ns + k * STEP_NS)
-    whole = subprocess.Popen([sys.executable, '-c', 'from hand_pose_ros.cli import main; main()',
-                              'evaluate', str(bag), str(bag), '--device', 'cpu', '--jobs', '2',
-                              '--out-bag', str(tmp_path / 'hands')], stderr=subprocess.PIPE, text=True,
-                             start_new_session=True)
+    whole = subprocess.Popen([sys.executable, '-m', 'hand_pose_ros.cli', 'evaluate', str(bag), str(bag), '--device',
+                              'cpu', '--jobs', '2', '--out-bag', str(tmp_path / 'hands')], stderr=subprocess.PIPE,
+                             text=True, start_new_session=True)
 
     def children():
         return Path(f'/proc/{whole.pid}/task/{whole.pid}/children').read_text().split()

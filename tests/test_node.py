@@ -50,7 +50,7 @@ pytestmark = pytest.mark.usefixtures('ros_domain')
 WIDTH, HEIGHT, FOCAL = 160, 120, 140.0
 BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
-COMMAND = [sys.executable, '-c', 'import sys; from hand_pose_ros.cli import main; sys.exit(main())']
+COMMAND = [sys.executable, '-m', 'hand_pose_ros.cli']
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 

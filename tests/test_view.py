@@ -1,6 +1,5 @@
 """What `hand-pose view` promises: depth images and hands where they belong, in a file that Rerun reads."""
 
-import os
 import signal
 import subprocess
 import sys
@@ -116,8 +115,7 @@ def test_live(tmp_path, weights, ros_domain):
     pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
     from test_node import Rig, camera_info, depth_with_hand, image
     out = tmp_path / 'live.rrd'
-    code = 'import sys; from hand_pose_ros.cli import main; sys.exit(main())'
-    process = subprocess.Popen([sys.executable, '-c', code, 'view', '--save', str(out)], env=dict(os.environ))
+    process = subprocess.Popen([sys.executable, '-m', 'hand_pose_ros.cli', 'view', '--save', str(out)])
     rig = Rig(weights)
     try:
         rig.start(side='right')

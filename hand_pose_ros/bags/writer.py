@@ -97,16 +97,13 @@ class BagWriter:
             latched: bag players offer the topic as transient local.
         """
         with naming_full_disk(self.path):
-            self._write(topic, msgtype, data, stamp_ns, latched)
-
-    def _write(self, topic: str, msgtype: str, data: bytes | memoryview, stamp_ns: int, latched: bool) -> None:
-        if topic not in self._connections:
-            qos = Qos(QosHistory.KEEP_LAST, 1 if latched else 10, QosReliability.RELIABLE,
-                      QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE,
-                      _FOREVER, _FOREVER, QosLiveliness.AUTOMATIC, _FOREVER, avoid_ros_namespace_conventions=False)
-            self._connections[topic] = self._writer.add_connection(
-                topic, msgtype, typestore=typestore(), offered_qos_profiles=[qos])
-        self._writer.write(self._connections[topic], int(stamp_ns), data)  # rosbags takes no integers of numpy
+            if topic not in self._connections:
+                qos = Qos(QosHistory.KEEP_LAST, 1 if latched else 10, QosReliability.RELIABLE,
+                          QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE,
+                          _FOREVER, _FOREVER, QosLiveliness.AUTOMATIC, _FOREVER, avoid_ros_namespace_conventions=False)
+                self._connections[topic] = self._writer.add_connection(
+                    topic, msgtype, typestore=typestore(), offered_qos_profiles=[qos])
+            self._writer.write(self._connections[topic], int(stamp_ns), data)  # rosbags takes no integers of numpy
 
     def write_depth(self, stamp_ns: int, frame_id: str, depth: NDArray[np.float32], intrinsics: Intrinsics, *,
                     topic: str = '/depth/image_rect', codec: str | None = 'png') -> None:

@@ -24,11 +24,12 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from sensor_msgs.msg import CompressedImage, Image
 
+from hand_pose_ros import ros
 from hand_pose_ros.bags import DepthBag
 from hand_pose_ros.conventions import camera_info_beside, split_transport, stamp_ns
 from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.msg import HandJointsArray, HandSkeleton
-from hand_pose_ros.ros import init, qos
+from hand_pose_ros.ros import qos
 from hand_pose_ros.ros.replay import Replay
 from hand_pose_ros.ros.topics import CAMERA_INFO, IMAGE
 
@@ -86,7 +87,7 @@ def play_through_node(bag: DepthBag, camera_info_topic: str | None = None,
     arguments += [item for name, topic in remappings.items() for item in ('-r', f'{name}:={topic}')]
     if ours := not rclpy.ok():
         qos.let_large_images_through()
-        init(signal_handler_options=SignalHandlerOptions.NO)  # else Ctrl-C ends the listener with a traceback
+        ros.init(signal_handler_options=SignalHandlerOptions.NO)  # else Ctrl-C ends the listener with a traceback
     try:
         with _listening(namespace, bag.depth_topic, Image if transport == 'raw' else CompressedImage) as listener, \
                 _running(arguments) as process:
@@ -174,8 +175,7 @@ def _listening(namespace: str, depth_topic: str, image_type: type) -> Iterator[_
 @contextmanager
 def _running(arguments: list[str]) -> Iterator[subprocess.Popen[bytes]]:
     """Run the node in another process. At the end, stop it as Ctrl-C does."""
-    code = 'import sys; from hand_pose_ros.cli import main; sys.exit(main())'
-    process = subprocess.Popen([sys.executable, '-c', code, 'estimator', '--ros-args', *arguments])
+    process = subprocess.Popen([sys.executable, '-m', 'hand_pose_ros.cli', 'estimator', '--ros-args', *arguments])
     try:
         yield process
     finally:

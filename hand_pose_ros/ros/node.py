@@ -340,9 +340,10 @@ class EstimatorNode(LifecycleNode):
         self._statistics.time(**estimator.timings)
         if hands:
             self._right_scale = params.depth_scale
-        problem = topics.NO_REGION.format(self.resolve_topic_name(topics.REGION)) if regions == [] else depth_problem(
+            return hands
+        problem = topics.explain_no_region(self) if regions == [] else depth_problem(
             depth, params.min_depth, params.max_depth, params.depth_scale == self._right_scale)
-        if not hands and problem:
+        if problem:
             self._complain(f'{self._image_topic}: {problem}')
         return hands
 

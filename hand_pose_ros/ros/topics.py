@@ -23,9 +23,6 @@ except ImportError:  # ROS 2 Humble
 
 IMAGE, CAMERA_INFO, REGION = 'depth/image_rect', 'depth/camera_info', 'hand/region'
 
-NO_REGION = ('no region arrived on {}, so no hand is looked for: publish where it is in the depth image, or set the '
-             'parameter detector to network')
-
 
 def input_topics(node: Node, transport: str) -> tuple[str, str]:
     """Resolved names of the depth image (with its transport) and of camera_info.
@@ -130,6 +127,12 @@ def explain_silence(node: Node, topic: str, message_type: type, seconds: float) 
             for listener in node.subscriptions):
         return explain_incompatible(node, topic, 'reliability')
     return f'{said}: if it does publish, {remedy_for_lost_images()}'
+
+
+def explain_no_region(node: Node) -> str:
+    """Why the node looks for no hand with the detector `region`, and what to do."""
+    return (f'no region arrived on {node.resolve_topic_name(REGION)}, so no hand is looked for: publish where it is in '
+            'the depth image, or set the parameter detector to network')
 
 
 def remedy_for_lost_images() -> str:

@@ -33,7 +33,7 @@ def test_a_gpu_without_enough_memory_is_told(arguments, remedy, monkeypatch, tmp
         monkeypatch.setattr(f'hand_pose_ros.{where}.check_device', full)
     assert main([*arguments, '--device', 'cuda']) == 1
     said = capsys.readouterr().err
-    assert said.startswith(f'hand-pose {arguments[0]}: CUDA out of memory: end what else uses the GPU')
+    assert said.startswith(f'hand-pose {arguments[0]}: CUDA out of memory: end other programs on the GPU')
     assert remedy in said and said.count('\n') == 1
 
 

@@ -1,7 +1,8 @@
 """The `hand-pose` command: one file per verb, imported only when it is asked for.
 
-A verb is a module with DESCRIPTION, EXAMPLES, `add_arguments(parser)` and `run(args) -> int`; `args.parser` is that
-parser. Exit codes: 0 done, 1 failed, 2 bad arguments.
+A verb is a module with DESCRIPTION, EXAMPLES, `add_arguments(parser)` and `run(args) -> int`. `args.parser` is that
+parser. If the module has a HINT, it follows the message about unknown arguments. Exit codes: 0 done, 1 failed, 2 bad
+arguments.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ VERBS = {
 
 
 class _Parser(argparse.ArgumentParser):
-    """Wrong arguments are told in one sentence, as everything else is, and not below all that could be given."""
+    """Reports bad arguments in one sentence, like all other errors, and without the usage."""
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f'{self.prog}: {message} (--help says what can be given)\n')
@@ -45,9 +46,11 @@ class _Parser(argparse.ArgumentParser):
 
 @contextmanager
 def _ending_like_ctrl_c() -> Iterator[None]:
-    """SIGTERM, too, leaves nothing half-made behind. Training and the node have handlers of their own meanwhile."""
+    """SIGTERM raises KeyboardInterrupt, so that nothing half-made is left behind. Training and the node have handlers
+    of their own.
+    """
     def stop(*_: object) -> None:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the next must not interrupt what this one begins
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second one must not interrupt the clean-up
         raise KeyboardInterrupt
 
     try:
@@ -62,20 +65,26 @@ def _ending_like_ctrl_c() -> Iterator[None]:
 
 
 def _open_standard_streams() -> None:
-    """Those that are closed lead nowhere: else a file that is opened takes their place, and what libraries print."""
+    """Open /dev/null in place of closed standard streams.
+
+    Otherwise, the next file that is opened takes the place of one, and receives what libraries print.
+    """
     for number in range(3):
         try:
             os.fstat(number)
         except OSError:
-            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # the lowest number that is free
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # it takes the lowest free number
     sys.stdout, sys.stderr = (stream or open(os.devnull, 'w') for stream in (sys.stdout, sys.stderr))  # noqa: SIM115
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors='backslashreplace')  # as standard error: names of files may be any bytes
+        sys.stdout.reconfigure(errors='backslashreplace')  # as on standard error, because file names may hold any bytes
 
 
 @contextmanager
 def _printing() -> Iterator[None]:
-    """What cannot be printed, as into `| head` or onto a full disk, is an OSError, and not told again at exit."""
+    """If something cannot be printed (`| head`, a full disk), name standard output in the OSError.
+
+    Without this, Python would report the error once more at exit.
+    """
     try:
         try:
             yield
@@ -133,7 +142,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         less = '--device cpu' if args.verb not in ('train', 'experiment') else (
             'a lower --set batch_size, and --workers 1 or more')
-        print(f'hand-pose {args.verb}: {str(error).partition(". ")[0]}: end what else uses the GPU, or give {less}',
+        print(f'hand-pose {args.verb}: {str(error).partition(". ")[0]}: end other programs on the GPU, or give {less}',
               file=sys.stderr)
         return 1
     except KeyboardInterrupt:

@@ -32,9 +32,9 @@ Record one hand, alone before the camera, that turns and opens and closes, for o
 quarters are learned from, the rest is for the comparison that is printed. docs/adapting.md says what to expect.
 """
 CHECKED = 500
-"""Frames of synthetic-test-v1 for what the network must not forget."""
+"""Number of frames of synthetic-test-v1. They show whether the network has forgotten other hands."""
 WORSE = 1.01
-"""From this factor of the error on them on, there is a warning."""
+"""If the error on these frames grows by more than this factor, there is a warning."""
 ROWS = {'found': ('images with a hand, %', 100.0), 'error_mm': ('mean error, mm', 1.0),
         'disagreement_mm': ('disagreement, mm', 1.0), 'jitter_mm': ('jitter, mm', 1.0),
         'bone_drift_mm': ('bone drift, mm', 1.0), 'explained': ('depth explained, %', 100.0)}
@@ -78,6 +78,7 @@ def run(args: argparse.Namespace) -> int:
     checkpoint = load_checkpoint(args.model)
     name = args.model or DEFAULT
     _check_fits(checkpoint, name)
+
     def evaluate(model: str | None, network: torch.nn.Module, what: str) -> tuple[Look, Engine, Numbers]:
         found = look(args.bag, Settings(model, 'cpu', estimator={'side': args.side}, bag=bag_options(args),
                                         ground_truth=args.ground_truth), _progress(f'{what}: images'))
@@ -96,7 +97,7 @@ def run(args: argparse.Namespace) -> int:
         'name': args.out.stem, 'data': f'synthetic hands of this package, and unlabelled depth of {args.bag.name}'}
     with tempfile.TemporaryDirectory() as folder:
         trial = Path(folder) / args.out.name
-        save_checkpoint(trial, network, metadata)  # what is judged is what is written, rounded to half precision
+        save_checkpoint(trial, network, metadata)  # judge what will be written: it is rounded to half precision
         network = load_checkpoint(trial).network
         _, _, after = evaluate(str(trial), network, 'after')
     test = [make_shard(open_dataset('synthetic', 'test'), 0, CHECKED)]
@@ -129,10 +130,10 @@ def run(args: argparse.Namespace) -> int:
 def _check_fits(checkpoint: Checkpoint, name: str) -> None:
     if checkpoint.metadata['skeleton'] != 'hand21':
         raise HandPoseError(f"{name}: its joints are those of {checkpoint.metadata['skeleton']}, but only weights for "
-                            'hand21 can be adapted: the synthetic hands that keep it from forgetting have these joints')
+                            'hand21 can be adapted: give others with --model')
     if checkpoint.refiner is not None:
-        raise HandPoseError(f'{name}: it has a refiner, which knows the errors of the network as it is: adapt weights '
-                            'without one')
+        raise HandPoseError(f'{name}: it has a refiner, which was trained on the errors of this very network: adapt '
+                            'weights without a refiner')
 
 
 def _progress(what: str) -> Progress:

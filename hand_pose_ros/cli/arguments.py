@@ -1,4 +1,4 @@
-"""What several verbs take on the command line, and kinds of values, refused with one sentence where they cannot be."""
+"""Arguments that several verbs have, and the types of their values. A bad value is refused in one sentence."""
 
 from __future__ import annotations
 
@@ -54,8 +54,9 @@ def none_or_more(text: str) -> int:
 
 
 def keep_input(output: str | Path | None, source: str | Path | None) -> None:
-    """Raise HandPoseError if an output would replace the input, or become a file of a bag that is a folder; None is no
-    file.
+    """Raise HandPoseError if an output would replace the input, or become a part of the bag that is the input.
+
+    None means no file.
     """
     if not (output and source and Path(source).exists()):
         return
@@ -66,7 +67,7 @@ def keep_input(output: str | Path | None, source: str | Path | None) -> None:
 
 
 def check_outputs(outputs: Iterable[str | Path | None], sources: Sequence[str | Path | None]) -> None:
-    """Raise HandPoseError, before minutes of work, if an output would replace a source or cannot be written."""
+    """Raise HandPoseError if an output would replace a source or cannot be written. Call this before the work."""
     for output in outputs:
         for source in sources:
             keep_input(output, source)
@@ -75,14 +76,14 @@ def check_outputs(outputs: Iterable[str | Path | None], sources: Sequence[str | 
 
 
 def refuse(args: argparse.Namespace, names: Iterable[str], why: str) -> None:
-    """Refuse options that were given, but are not for what is to be done; `args.parser` is the parser."""
+    """Refuse options that were given but do not apply. `why` follows the name of the option."""
     for name in names:
         if getattr(args, name) != args.parser.get_default(name):
             args.parser.error(f'--{name.replace("_", "-")} {why}')
 
 
 def add_bag(parser: Any) -> None:
-    """How depth is read from a bag."""
+    """Add how depth is read from a bag."""
     parser.add_argument('--depth-topic', metavar='TOPIC',
                         help='topic of the depth images; needed if several topics carry depth')
     parser.add_argument('--camera-info-topic', metavar='TOPIC',
@@ -93,7 +94,7 @@ def add_bag(parser: Any) -> None:
 
 
 def check_intrinsics(args: argparse.Namespace) -> None:
-    """Refuse --intrinsics that are those of no camera, before any work."""
+    """Raise InputError if no camera has these --intrinsics. Call this before the work."""
     if args.intrinsics:
         with naming('--intrinsics'):
             fx, fy, cx, cy = args.intrinsics
@@ -101,7 +102,7 @@ def check_intrinsics(args: argparse.Namespace) -> None:
 
 
 def bag_options(args: argparse.Namespace) -> dict[str, Any]:
-    """For `DepthBag`."""
+    """The arguments of `add_bag`, for `DepthBag`."""
     check_intrinsics(args)
     return {'depth_topic': args.depth_topic, 'camera_info_topic': args.camera_info_topic,
             'intrinsics': args.intrinsics and tuple(args.intrinsics), 'depth_scale': args.depth_scale}
@@ -114,7 +115,7 @@ ESTIMATOR = ('model', 'device', 'side', 'detector', 'cube_size', 'min_score')
 
 
 def add_estimator(parser: Any) -> None:
-    """How hands are estimated."""
+    """Add how hands are estimated."""
     parser.add_argument('--model', help='name of weights that ship, or path of a checkpoint (hand_dense)')
     parser.add_argument('--device', default='auto', help='auto, cpu, cuda or cuda:N (auto)')
     parser.add_argument('--side', default='auto', choices=('auto', 'left', 'right'), help='which hand it is (auto)')
@@ -126,6 +127,6 @@ def add_estimator(parser: Any) -> None:
 
 
 def estimator_options(args: argparse.Namespace) -> dict[str, Any]:
-    """For `HandPoseEstimator.from_pretrained`, but for model and device."""
+    """The arguments of `add_estimator` without model and device, for `HandPoseEstimator.from_pretrained`."""
     given = {'side': args.side, 'detector': args.detector, 'cube_side': args.cube_size, 'min_score': args.min_score}
     return {name: value for name, value in given.items() if value is not None}

@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _network_rows(name: str, threads: int, rounds: int, compiled: bool) -> dict[str, dict[str, float]]:
-    """One network, one patch, over every way to run it."""
+    """One network on one patch, in every way to run it."""
     import numpy as np
     import torch
 
@@ -87,7 +87,7 @@ def _network_rows(name: str, threads: int, rounds: int, compiled: bool) -> dict[
     from hand_pose_ros.runtime.engine import Pipeline, TorchEngine
     from hand_pose_ros.runtime.timing import measure, some_patches
 
-    pipeline = Pipeline(load_checkpoint(name).network).eval()  # the export puts modules back into the mode of the whole
+    pipeline = Pipeline(load_checkpoint(name).network).eval()  # the export restores the mode of the whole
     patch = some_patches(1)
     array = patch.numpy()
     engine = make_engine(pipeline.network, 'cpu', threads)
@@ -103,7 +103,7 @@ def _network_rows(name: str, threads: int, rounds: int, compiled: bool) -> dict[
         try:
             fast(patch)
             calls['torch.compile'] = lambda: fast(patch)
-        except Exception as error:  # whatever a compiler that is missing or too old comes up with
+        except Exception as error:  # a missing or old compiler can cause any error
             print(f'torch.compile does not work here: {str(error).splitlines()[0]}')
     calls['engine, 8 hands'] = lambda: engine.run(eight)
     rows = {**measure(calls, rounds), 'floor': _floor(pipeline, (patch,))}
@@ -165,7 +165,10 @@ def _refiner_rows(architecture: str, threads: int, rounds: int) -> dict[str, dic
 
 
 def _frame_rows(model: str | None, threads: int, rounds: int) -> dict[str, dict[str, float]]:
-    """From a VGA image of 16-bit integers to joints in metres, in all and by stage; a hand that is tracked."""
+    """Whole frames and their stages, from a VGA image of 16-bit integers to joints in metres.
+
+    The hand is tracked, except in the rows `searching`.
+    """
     from hand_pose_ros.depth import to_metres, to_units
     from hand_pose_ros.estimator import HandPoseEstimator
     from hand_pose_ros.runtime.timing import WARM_UP, measure, summary
@@ -201,7 +204,7 @@ def _frame_rows(model: str | None, threads: int, rounds: int) -> dict[str, dict[
 
 
 def _floor(module: nn.Module, inputs: tuple[Tensor, ...], reads: int = 1) -> dict[str, float]:
-    """The least time that the operations and the weights of a module need here: a row, with both parts."""
+    """A row with the least time that the operations and the weights of a module need here, and with both parts."""
     import torch
     from torch.utils.flop_counter import FlopCounterMode
 
@@ -213,7 +216,7 @@ def _floor(module: nn.Module, inputs: tuple[Tensor, ...], reads: int = 1) -> dic
     side = 512
     square, matrix = torch.rand(side, side), torch.rand(-(-weights // side), side)
     times = measure({'multiply': lambda: square @ square, 'read': lambda: matrix @ square[0]}, rounds=3)
-    # The best of many, for a floor is what no one has gone below.
+    # The minimum, because nothing is faster than a floor.
     compute = times['multiply']['min_ms'] * operations / (2 * side ** 3)
     memory = times['read']['min_ms'] * reads
     floor = max(compute, memory)
@@ -223,13 +226,13 @@ def _floor(module: nn.Module, inputs: tuple[Tensor, ...], reads: int = 1) -> dic
 
 def _vga_frame() -> tuple[Any, Any]:
     """A rendered hand before a room, 640 x 480, in metres, and the intrinsics."""
-    from itertools import count
+    import itertools
 
     from hand_pose_ros.detection import detect
     from hand_pose_ros.synthetic.generator import SyntheticHands
 
     hands = SyntheticHands('train')
-    frames = (hands.full_frame(index) for index in count())
+    frames = (hands.full_frame(index) for index in itertools.count())
     return next((depth, intrinsics) for depth, intrinsics, _, side in frames
                 if depth.shape == (480, 640) and side != 'none' and detect(depth, intrinsics))
 

@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
         print(f'NOTE: {note}', file=sys.stderr)
     for result in results:
         if result.truth is None:
-            raise InputError(f'{result.name} has no ground truth to be compared on: evaluate it with --ground-truth')
+            raise InputError(f'{result.name} has no ground truth: evaluate it with --ground-truth')
     summaries = [result.summary() for result in results]
     print_summaries(zip((result.name for result in results), summaries, strict=True))
     first, differences = results[0], []
@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _not_paired(a: Result, b: Result) -> str:
-    """Why two results cannot be compared frame by frame, '' if they can."""
+    """Why two results cannot be compared frame by frame; empty if they can."""
     assert a.truth is not None and b.truth is not None
     if a.predictions.shape != b.predictions.shape:
         return f'have {len(a.predictions)} and {len(b.predictions)} frames' if a.skeleton == b.skeleton \

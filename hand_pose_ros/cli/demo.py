@@ -1,4 +1,4 @@
-"""`hand-pose demo`: a bag through the live node, over real DDS, and what came out, to look at."""
+"""`hand-pose demo`: play a bag through the live node, over real DDS, and draw what comes out."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Play, draw, and sum up; 1 if an image was left without an answer."""
+    """Play the bag, draw the answers and print a summary. Returns 1 if an image got no answer."""
     from hand_pose_ros.evaluation.bag_evaluation import until_damaged
     from hand_pose_ros.ros.conversions import hand_from_msg
     from hand_pose_ros.ros.live import play_through_node
@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
         notes: list[str] = []
         for frame, _ in until_damaged(bag, notes):
             stamps.append(frame.stamp_ns)
-            with suppress(InputError):  # one that cannot be decoded; the node tells of it
+            with suppress(InputError):  # it cannot be decoded, and the node reports it
                 pictures.append(overlay(frame.depth, frame.intrinsics, hands.get(frame.stamp_ns, []), skeleton,
                                         ANIMATION_HEIGHT))
                 shown.append(frame.stamp_ns)
@@ -87,20 +87,20 @@ def run(args: argparse.Namespace) -> int:
     write_json(args.out / 'summary.json', summary)
     for name, value in summary.items():
         print(f'  {name.replace("_", " "):<22}{value if isinstance(value, int) or value is None else f"{value:.1f}"}')
-    print('latency: from an image to its joints at a listener beside the node; with transport and decoding (PNG in the '
-          'bag that ships)')
+    print('latency: from the arrival of an image at a listener to the arrival of its joints there, with decoding (PNG '
+          'in the bag that ships)')
     print(f'see {args.out / "sheet.png"} and {args.out / "animation.webp"}')
     return 0 if summary['frames_answered'] == summary['frames_in'] else 1
 
 
 def summarise(stamps: Sequence[int], answers: Answers, hands: dict[int, list[HandEstimate]],
               truth: dict[int, RecordedHands]) -> dict[str, float | int | None]:
-    """What the table shows; times in ms, errors in mm, None for what cannot be known.
+    """The numbers of the summary: times in ms, errors in mm, None for what is unknown.
 
     Args:
         stamps: of the images that were played, ns.
-        hands: stamp -> what the node answered.
-        truth: stamp -> what is really there. The first hand of each is compared.
+        hands: stamp -> the hands in the answer of the node.
+        truth: stamp -> the true hands. The first hand of each is compared.
     """
     latency_ms = np.array([answers.latency_s[stamp] for stamp in stamps if stamp in answers.latency_s]) * 1e3
     errors_mm = [np.linalg.norm(hands[stamp][0].joints - truth[stamp].joints[0], axis=1) * 1e3
@@ -117,11 +117,11 @@ def summarise(stamps: Sequence[int], answers: Answers, hands: dict[int, list[Han
 
 
 def _truth(path: Path, skeleton: Skeleton) -> dict[int, RecordedHands]:
-    """By stamp, where it is of the same joints."""
+    """Stamp -> the true hands, if the bag has them with the joints of this skeleton."""
     try:
         return {hands.stamp_ns: hands for hands in read_hands(path, TRUTH_TOPIC) if hands.skeleton == skeleton.name}
     except InputError:
-        return {}  # a bag of a real camera
+        return {}  # recorded with a real camera
 
 
 def _animate(path: Path, pictures: Sequence[Picture], stamps: Sequence[int]) -> None:

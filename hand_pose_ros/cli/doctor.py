@@ -1,4 +1,4 @@
-"""`hand-pose doctor`: what is installed here, whether it works, and what to do where it does not."""
+"""`hand-pose doctor`: what is installed here, whether it works, and what to do if it does not."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ LIBRARIES = ('numpy', 'cv2', 'torch', 'safetensors', 'onnx', 'onnxruntime', 'ros
              'filelock')
 SHARED_MEMORY = Path('/dev/shm')
 DEFAULT_SEGMENT = 512 * 1024
-"""Bytes of the shared-memory segment of Fast DDS where no profile says otherwise."""
+"""Bytes of the shared-memory segment of Fast DDS without a profile."""
 VGA_IMAGE = 640 * 480 * 2
 ENOUGH_SHARED_MEMORY = 64 << 20
-"""Bytes; every process with the profile for large images takes a segment of 16 MB."""
+"""Bytes. Every process with the profile for large images takes a segment of 16 MB."""
 
 Findings = Iterator[tuple[Literal['ok', 'note', 'WRONG'], str]]
-"""What a check has to say, a line each."""
+"""What a check finds: level and text of each line."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the report; 1 if anything is wrong."""
+    """Print the report. Returns 1 if anything is wrong."""
     wrong = 0
     for about, check in CHECKS.items():
         for level, text in _examine(check):
@@ -57,12 +57,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _examine(check: Callable[[], Findings]) -> Findings:
-    """The findings of one check; whatever it fails with is one."""
+    """The findings of one check. If the check fails, this is a finding, too."""
     try:
         yield from check()
     except HandPoseError as error:
         yield 'WRONG', str(error)
-    except Exception as error:  # a broken installation fails in its own ways; the other checks go on
+    except Exception as error:  # a broken installation can cause any error
         yield 'WRONG', f'cannot be used ({type(error).__name__}: {error}): reinstall the package'
 
 
@@ -136,8 +136,8 @@ def _ros() -> Findings:
             yield 'WRONG', (f'ROS 2 {distro} is sourced, but {sys.executable} finds no rclpy: use the Python that this '
                             'ROS was built for, in a virtual environment made with --system-site-packages')
         else:
-            yield 'note', ('none: the node, replay and demo need it, all else works; source its setup file, or in the '
-                           "checkout: pip install '.[ros]'")
+            yield 'note', ('none: the node, replay and demo need it, and all else works without it. Source its setup '
+                           "file, or run pip install '.[ros]' in the checkout")
         return
     settings = _ros_settings()
     if failure := _ros_failure(settings):
@@ -149,7 +149,7 @@ def _ros() -> Findings:
 
 
 def _ros_settings() -> tuple[str, ...]:
-    """What the environment says to ROS, as NAME=value."""
+    """The environment variables that ROS reads, as NAME=value."""
     return tuple(f'{name}={os.environ[name]}' for name in (
         'RMW_IMPLEMENTATION', 'ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'ROS_LOCALHOST_ONLY')
         if name in os.environ)
@@ -157,7 +157,7 @@ def _ros_settings() -> tuple[str, ...]:
 
 @lru_cache(maxsize=1)
 def _ros_failure(_settings: tuple[str, ...]) -> str:
-    """Why no node can be started with these settings, empty if one can; tried in a process, which ROS may end."""
+    """Why no node can be started with these settings; empty if one can. ROS may end the process that tries it."""
     code = ('import sys\nfrom hand_pose_ros.errors import HandPoseError\ntry:\n    from hand_pose_ros import ros\n'
             '    import rclpy\n    ros.init()\n    rclpy.create_node("doctor")\n'
             'except HandPoseError as error:\n    sys.exit(str(error))')
@@ -178,10 +178,9 @@ def _dds_profile() -> Findings:
     elif given is None:
         for other in set(PROFILE_VARIABLES) & set(os.environ):
             yield 'WRONG', f'{other} is set, which this ROS does not read: name it {variable}'
-        yield 'note', (f'none: who publishes images from this shell has a shared-memory segment of '
-                       f'{DEFAULT_SEGMENT // 1024} kB, into which a VGA depth image ({VGA_IMAGE // 1000} kB) does not '
-                       f'fit; before the camera driver starts: export {variable}={ours} (replay and demo do so '
-                       'themselves)')
+        yield 'note', (f'none: publishers in this shell get a shared-memory segment of {DEFAULT_SEGMENT // 1024} kB, '
+                       f'too small for a VGA depth image ({VGA_IMAGE // 1000} kB). Before you start the camera driver, '
+                       f'export {variable}={ours} (replay and demo do so themselves)')
     else:
         try:
             segment = segment_size(Path(given))

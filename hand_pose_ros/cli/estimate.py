@@ -68,7 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Estimate, write what was asked for, and sum up; 1 if any image could not be used."""
+    """Estimate, write the outputs and print a summary. Returns 1 if any image could not be used."""
     if args.out and args.out.suffix not in ('.npz', '.mcap'):
         args.parser.error(f'--out {args.out}: the name must end in .npz or .mcap')
     if not args.input.exists():
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
     keep_input(args.out, args.input)
     keep_input(args.overlay, args.input.parent if args.input.suffix.lower() == '.png' else args.input)
     with ExitStack() as stack:
-        images, count = _open(args, stack)
+        images, number = _open(args, stack)
         from hand_pose_ros.estimator import HandPoseEstimator  # imports torch: not for --help and bad arguments
         estimator = HandPoseEstimator.from_pretrained(args.model, device=args.device, max_hands=args.max_hands,
                                                       **estimator_options(args))
@@ -89,14 +89,14 @@ def run(args: argparse.Namespace) -> int:
             sinks.append(_Arrays(args.out, estimator.skeleton))
         elif args.out:
             sinks.append(_Messages(stack.enter_context(HandBag(args.out, estimator.skeleton, estimator.metadata))))
-        failed = estimate(images, count, estimator, sinks)
+        failed = estimate(images, number, estimator, sinks)
     print('wrote', ' and '.join(str(path) for path in (args.out, args.overlay) if path))
     return failed
 
 
 @dataclass(frozen=True)
 class DepthInput:
-    """One image to work on; `load` gives its depth (H, W) in metres and its intrinsics, or raises InputError."""
+    """One depth image. `load` returns its depth (H, W) in metres and its intrinsics, or raises InputError."""
 
     name: str
     stamp_ns: int
@@ -106,22 +106,28 @@ class DepthInput:
 
 
 class _Sink(Protocol):
-    """Somewhere results go."""
+    """Writes the results in one way."""
 
     def add(self, image: DepthInput, depth: NDArray[np.float32], intrinsics: Intrinsics,
             hands: Sequence[HandEstimate]) -> None: ...
 
     def finish(self) -> None:
-        """All images were added."""
+        """Called when all images were added."""
         return
 
 
-def estimate(images: Iterator[DepthInput], count: int, estimator: HandPoseEstimator, sinks: Sequence[_Sink]) -> int:
-    """Run the estimator over all images and feed the sinks; an image that cannot be used is reported and left out."""
+def estimate(images: Iterator[DepthInput], number: int, estimator: HandPoseEstimator, sinks: Sequence[_Sink]) -> int:
+    """Run the estimator over all images and pass the results to the sinks. Returns 1 if any image could not be used.
+
+    Such images are reported and left out.
+
+    Raises:
+        InputError: none of the images could be used.
+    """
     done = found = failed = 0
     problem, said = '', ''
     seconds: list[float] = []
-    for image in tqdm(images, total=count, unit='image', disable=None):
+    for image in tqdm(images, total=number, unit='image', disable=None):
         try:
             depth, intrinsics = image.load()
             start = time.perf_counter()
@@ -129,7 +135,7 @@ def estimate(images: Iterator[DepthInput], count: int, estimator: HandPoseEstima
             seconds.append(time.perf_counter() - start)
         except InputError as error:
             failed += 1
-            if str(error) != said:  # mostly the same is wrong with all
+            if str(error) != said:  # mostly, the same is wrong with all of them
                 tqdm.write(f'hand-pose estimate: {error}', file=sys.stderr)
             said = str(error)
             continue
@@ -145,8 +151,8 @@ def estimate(images: Iterator[DepthInput], count: int, estimator: HandPoseEstima
     print(f'{done} image{"s" if done > 1 else ""}, {found} with a hand, {failed} that could not be used; '
           f'{1000 * float(np.median(seconds)):.1f} ms for the median image')
     if not found:
-        hint = (f'nothing had a score of {estimator.min_score:g} or more, which a network that was hardly trained does '
-                'not reach: --min-score 0 shows what is most like a hand')
+        hint = (f'nothing had a score of {estimator.min_score:g} or more, which networks with little training do not '
+                'reach: --min-score 0 shows what is most like a hand')
         print(f'hand-pose estimate: {problem or hint}', file=sys.stderr)
     return 1 if failed else 0
 
@@ -160,10 +166,10 @@ def _open(args: argparse.Namespace, stack: ExitStack) -> tuple[Iterator[DepthInp
         raise InputError(f'{args.input}: the folder holds neither 16-bit depth .png files nor a bag')
     if paths:
         if args.intrinsics is None:
-            args.parser.error('PNGs come without a camera: give --intrinsics FX FY CX CY')
+            args.parser.error('PNGs have no camera_info: give --intrinsics FX FY CX CY')
         refuse(args, ('depth_topic', 'camera_info_topic'), 'is for bags: PNGs have no topics')
         check_intrinsics(args)
-        for path in paths:  # each, for they may be links into the folder of the pictures
+        for path in paths:  # any of them may be a link into the folder of the pictures
             keep_input(args.overlay and args.overlay / f'{path.stem}.png', path)
         return _from_pngs(paths, args.intrinsics, args.depth_scale or 0.001), len(paths)
     bag = stack.enter_context(DepthBag(args.input, **bag_options(args)))
@@ -183,7 +189,7 @@ def _from_pngs(paths: Sequence[Path], intrinsics: Sequence[float], depth_scale: 
 
 
 def from_bag(bag: DepthBag) -> Iterator[DepthInput]:
-    """The images of a bag; what is damaged of it is one more, which cannot be loaded."""
+    """The images of a bag. If it is damaged, one more follows, and to load this one raises the error."""
     i = 0
     try:
         for i, frame in enumerate(bag, start=1):
@@ -207,7 +213,7 @@ class _Overlays(_Sink):
         self._folder, self._skeleton = folder, skeleton
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.glob('*.png')):
-            print(f'NOTE: {folder} holds pictures already; those of other images stay', file=sys.stderr)
+            print(f'NOTE: {folder} holds pictures already, and those of other images stay there', file=sys.stderr)
 
     def add(self, image: DepthInput, depth: NDArray[np.float32], intrinsics: Intrinsics,
             hands: Sequence[HandEstimate]) -> None:

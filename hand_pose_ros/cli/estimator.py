@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the node; 0 after Ctrl-C.
+    """Run the node until Ctrl-C, which is no error.
 
     Raises:
         HandPoseError: there is no ROS, or a parameter is wrong.

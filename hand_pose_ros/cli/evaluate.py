@@ -54,10 +54,9 @@ name. The file may be gzipped.
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the verb takes."""
-    parser.add_argument('bags', nargs='*', metavar='BAG', help='a ROS 1 file, a ROS 2 folder, '
-                        'or an .mcap or .db3 file; or '
-                        'synthetic-test-v1, the benchmark, which is made on the spot; or nyu, icvl, msra or msra:P1 to '
-                        'msra:P8 with --root')
+    parser.add_argument('bags', nargs='*', metavar='BAG', help='a ROS 1 file, a ROS 2 folder, or an .mcap or .db3 '
+                        'file; or synthetic-test-v1, the benchmark, which is made on the spot; or, with --root, nyu, '
+                        'icvl, msra or msra:P1 to msra:P8')
     parser.add_argument('--ground-truth', metavar='G', help='text file of labels; with a bag also an .npz file with '
                         'joints (frames, joints, 3) in metres, or a topic of the bag with HandJointsArray')
     parser.add_argument('--json', metavar='FILE', help='write all numbers to this file')
@@ -79,18 +78,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_estimator(bags)
     bags.add_argument('--out-bag', metavar='BAG', help='write /hand/joints and /hand/markers there, to be played '
                       'beside the original; with several bags a folder')
-    bags.add_argument('--via-ros', action='store_true',
-                      help='play the bag through the live node at the recorded rate, and '
-                      'report dropped images and the latency from image to joints')
+    bags.add_argument('--via-ros', action='store_true', help='play the bag through the live node at the recorded rate, '
+                      'and report dropped images and the latency from image to joints')
+    bags.add_argument('--jobs', type=count, metavar='N',
+                      help='how many bags to process at the same time (default: one per core)')
     recorded = parser.add_argument_group('recorded datasets')
     recorded.add_argument('--root', type=Path, metavar='FOLDER', help='folder of nyu, icvl or msra, as distributed')
     recorded.add_argument('--split', help='test (the default), val or train; nyu and icvl also have test_1 and test_2')
-    bags.add_argument('--jobs', type=count, metavar='N',
-                      help='how many bags to process at the same time (default: one per core)')
 
 
 def run(args: argparse.Namespace) -> int:
-    """Evaluate, print, and write what was asked for; 1 if a bag failed or was damaged."""
+    """Evaluate, write the outputs and print the numbers. Returns 1 if a bag failed or is damaged."""
     if bool(args.bags) == bool(args.predictions):
         args.parser.error('give either bags or --predictions')
     if args.out and len(args.bags) < 2 and Path(args.out).suffix != '.npz':
@@ -134,7 +132,7 @@ def _run_text(args: argparse.Namespace) -> int:
         fx, fy, cx, cy = args.intrinsics
         dataset = replace(dataset, intrinsics=replace(dataset.intrinsics, fx=fx, fy=fy, cx=cx, cy=cy))
     if args.depth_folder:
-        from hand_pose_ros.evaluation import tompson  # and torch, for which text alone need not wait
+        from hand_pose_ros.evaluation import tompson  # imports torch, which text alone does not need
 
     if Path(args.predictions).suffix == '.npz':
         if not args.depth_folder:
@@ -143,8 +141,8 @@ def _run_text(args: argparse.Namespace) -> int:
     else:
         result = published.load_published(args.predictions, args.ground_truth, dataset)
     if args.depth_folder and len(result.predictions) != published.DATASETS['nyu'].frames:
-        raise InputError('--depth-folder needs all 8252 test frames of NYU: which depth image belongs to which row of '
-                         f'{args.predictions} is unknown')
+        raise InputError(f'--depth-folder needs all 8252 test frames of NYU, but {args.predictions} has '
+                         f'{len(result.predictions)}: leave out --depth-folder')
     others = [published.load_result(source, args.ground_truth, dataset) for source in args.compare]
     read_depths = partial(tompson.read_nyu_depths, args.depth_folder) if args.depth_folder else None
     _deliver(result, others, read_depths, args.json, args.out, args.report, args.compare)
@@ -156,7 +154,7 @@ def _run_bag(args: argparse.Namespace) -> int:
     from hand_pose_ros.evaluation.bag_evaluation import evaluate_bag, read_depths
 
     keep_input(args.out_bag, args.bags[0])
-    others = [published.load_result(source) for source in args.compare]  # before the work, for they may be missing
+    others = [published.load_result(source) for source in args.compare]  # before the work: one may be missing
     settings = _settings(args)
     sink = partial(HandBag, args.out_bag) if args.out_bag else None
     result = _evaluate_live(args, settings) if args.via_ros else \
@@ -167,7 +165,7 @@ def _run_bag(args: argparse.Namespace) -> int:
 
 
 def _evaluate_live(args: argparse.Namespace, settings: Settings) -> Result:
-    """What the live node answers to a bag; images without an answer count as images without a hand."""
+    """The answers of the live node to a bag. Images without an answer count as images without a hand."""
     if args.out_bag:
         args.parser.error('--out-bag does not work with --via-ros: record /hand/joints instead')
     from hand_pose_ros.bags import DepthBag
@@ -179,7 +177,7 @@ def _evaluate_live(args: argparse.Namespace, settings: Settings) -> Result:
 
     parameters = {'model': args.model, 'device': args.device, 'side': args.side, 'detector': args.detector,
                   'cube_size': args.cube_size, 'min_score': args.min_score, 'depth_scale': args.depth_scale,
-                  'max_hands': 1}  # as without the node: one hand is compared, and others would cost time
+                  'max_hands': 1}  # as without the node: only one hand is compared
     if args.intrinsics:
         parameters |= {f'intrinsics.{name}': value for name, value in zip(('fx', 'fy', 'cx', 'cy'), args.intrinsics,
                                                                           strict=True)}
@@ -192,7 +190,7 @@ def _evaluate_live(args: argparse.Namespace, settings: Settings) -> Result:
         for frame, _ in until_damaged(bag, notes):
             stamps.append(frame.stamp_ns)
             if intrinsics is None:
-                with suppress(InputError):  # one image that cannot be decoded is none that was lost
+                with suppress(InputError):  # it cannot be decoded; any other image will do
                     intrinsics, frame_id = frame.intrinsics, frame.frame_id
         if intrinsics is None:
             raise InputError(f'{args.bags[0]}: there is no depth image that can be decoded')
@@ -243,7 +241,7 @@ def _run_bags(args: argparse.Namespace) -> int:
                 _deliver(result, [], partial(read_depths, bag, settings=settings),
                          out=args.out and Path(args.out) / f'{result.name}.npz',
                          report=args.report and Path(args.report) / result.name)
-    finally:  # after Ctrl-C, too
+    finally:  # also after Ctrl-C
         if args.json and summaries:
             write_json(args.json, {'bags': {bag: summaries[bag] for bag in args.bags if bag in summaries}})
     failed = [bag for bag, summary in summaries.items() if 'error' in summary or summary['damaged']]
@@ -260,7 +258,7 @@ def _settings(args: argparse.Namespace) -> Settings:
 
 
 def _names(bags: Sequence[str]) -> dict[str, str]:
-    """A short name for each bag, which no other has."""
+    """A short, unique name for each bag."""
     stems = [Path(bag).stem for bag in bags]
     names: dict[str, str] = {}
     for bag, stem in zip(bags, stems, strict=True):
@@ -273,12 +271,12 @@ def _names(bags: Sequence[str]) -> dict[str, str]:
 def _deliver(result: Result, others: Sequence[Result], read_depths: Callable[[Sequence[int]], dict[int, Any]] | None,
              json: str | None = None, out: str | Path | None = None, report: str | Path | None = None,
              sources: Sequence[str] = ()) -> None:
-    """Write the files that were asked for, and print the numbers; `sources` are those of the others."""
+    """Write the outputs and print the numbers. `sources` are the files of the other results."""
     result, *others = published.named_apart([result, *others], ['', *sources])
     for note in told_notes([result, *others]):
         print(f'NOTE: {note}', file=sys.stderr)
     summary = result.summary()
-    if json:  # the files first, for printing may fail
+    if json:  # files come first, because printing may fail
         write_json(json, summary)
     if out:
         result.save(out)
@@ -291,7 +289,7 @@ def _deliver(result: Result, others: Sequence[Result], read_depths: Callable[[Se
 
 
 def print_summaries(summaries: Iterable[tuple[str, dict[str, Any]]]) -> None:
-    """Print accuracy as one table, and for each result what needs no truth."""
+    """Print one table of accuracy, and for each result the numbers that need no truth."""
     summaries = list(summaries)
     rows = [row for name, summary in summaries if 'mean_mm' in summary for row in accuracy_rows(name, summary)]
     if rows:
@@ -301,7 +299,7 @@ def print_summaries(summaries: Iterable[tuple[str, dict[str, Any]]]) -> None:
             continue
         line = (f'{name}: {summary["frames_total"]} frames, {number(summary["detection_rate"], 1, " %", 100)} with a '
                 f'hand, {_pace(summary)}')
-        if 'mean_mm' not in summary:  # else the table says more
+        if 'mean_mm' not in summary:  # with truth, the table says more
             line += (f', jitter {number(summary["jitter_mm"], 2, " mm")}, '
                      f'bone drift {number(summary["bone_drift_mm"], 2, " mm")}')
         print(line)
@@ -315,4 +313,4 @@ def _pace(summary: dict[str, Any]) -> str:
 
 
 def _progress(unit: str) -> Callable[[Iterable[Any], int], Iterable[Any]]:
-    return lambda items, total: tqdm(items, total=total, unit=f' {unit}', disable=None)  # a terminal only
+    return lambda items, total: tqdm(items, total=total, unit=f' {unit}', disable=None)  # only on a terminal

@@ -1,4 +1,4 @@
-"""A bag with the messages that the node would publish, to be played beside the one that the images come from."""
+"""A bag with the messages that the node would publish. It can be played beside the bag of the images."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TOPICS = ('/hand/joints', '/hand/markers', '/hand/skeleton')
 
 
 class Stamped(Protocol):
-    """An image, or whatever else has its stamp, its frame and the time of its recording."""
+    """What is needed of an image: its stamp, its frame and the time of its recording."""
 
     @property
     def stamp_ns(self) -> int: ...
@@ -33,7 +33,7 @@ class HandBag:
 
     Args:
         path: a file (.mcap, .db3), or the folder of a ROS 2 bag.
-        metadata: of the estimator; tells the model.
+        metadata: of the estimator. It names the model.
 
     Raises:
         InputError: the bag cannot be written, or would replace one with other topics.
@@ -53,7 +53,7 @@ class HandBag:
         self._writer.__exit__(*error)
 
     def add(self, image: Stamped, hands: Sequence[HandEstimate]) -> None:
-        """Write the hands of an image, none included, at the time of its recording."""
+        """Write the hands of an image, even if there are none. Their time of recording is that of the image."""
         header, time = (image.stamp_ns, image.frame_id), image.recorded_ns
         if not self._begun:
             from hand_pose_ros.models.checkpoints import described  # imports torch: not for --help
@@ -64,7 +64,7 @@ class HandBag:
 
 
 def _keep_recording(path: Path) -> None:
-    """Raise InputError if there is a bag with anything else than what a HandBag writes, which would be lost."""
+    """Raise InputError if there is a bag with topics that a HandBag does not write. They would be lost."""
     topics: set[str] = set()
     if path.is_file():
         with suppress(InputError), Bag(path) as bag:

@@ -17,8 +17,8 @@ EXAMPLES = """examples:
 While it plays, pause (true) and continue (false) with
   ros2 service call /replay/pause std_srvs/srv/SetBool "{data: true}"
 """
-_ENDLESS = 1e9
-"""Beyond it nanoseconds do not fit into the times of messages."""
+_MAX = 1e9
+"""Largest rate, and largest time in seconds. The nanoseconds of longer times do not fit into messages."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,23 +41,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Play until the end of the bag, or with --loop until Ctrl-C; 0 when everything was published.
+    """Play until the end of the bag, or with --loop until Ctrl-C. Returns 1 if Ctrl-C came before the end.
 
     Raises:
         HandPoseError: there is no ROS, or the bag cannot be read.
     """
-    if not 0 < args.rate <= _ENDLESS:
-        args.parser.error(f'--rate {args.rate:g}: must be more than 0, and finite')
-    if not 0 <= args.start <= _ENDLESS:
-        args.parser.error(f'--start {args.start:g}: must be 0 or more, and finite')
-    if not 0 <= args.wait <= _ENDLESS:
-        args.parser.error(f'--wait {args.wait:g}: must be 0 or more, and finite')
-    from hand_pose_ros.ros.replay import replaying  # says what is missing where there is no ROS
+    if not 0 < args.rate <= _MAX:
+        args.parser.error(f'--rate {args.rate:g}: must be more than 0 and at most {_MAX:g}')
+    for name in ('start', 'wait'):
+        if not 0 <= getattr(args, name) <= _MAX:
+            args.parser.error(f'--{name} {getattr(args, name):g}: must be 0 to {_MAX:g}')
+    from hand_pose_ros.ros.replay import replaying  # without ROS, this says what is missing
 
     with replaying(args.bag, args.ros_args, topics=args.topics, rate=args.rate, reliability=args.qos, clock=args.clock,
                    paused=args.start_paused) as replay:
         topics = ', '.join(sorted(map(replay.name, replay.published)))
-        print(f'{args.bag}: publishing {topics} from in {args.wait:g} s on: subscribers must find it first', flush=True)
+        print(f'{args.bag}: publishing {topics} after {args.wait:g} s, in which subscribers can find it', flush=True)
         code = 0
         try:
             replay.wait_for_subscribers(args.wait)
@@ -65,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
             while args.loop:
                 replay.play(args.start)
         except KeyboardInterrupt:
-            code = int(not args.loop)  # it is how a loop ends
+            code = int(not args.loop)  # a loop ends this way
         finally:
             for topic, count in sorted((replay.name(topic), count) for topic, count in replay.published.items()):
                 print(f'{count:7d}  {topic}')

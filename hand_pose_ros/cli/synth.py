@@ -1,4 +1,4 @@
-"""`hand-pose synth`: look at synthetic hands, write them to disk, compare them with real ones."""
+"""`hand-pose synth`: draw synthetic hands, write them to disk, and compare them with real ones."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _ZOOM = 2
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the verb takes."""
-    from hand_pose_ros.synthetic.sensors import SENSORS  # imports torch, as all that this verb does
+    from hand_pose_ros.synthetic.sensors import SENSORS  # imports torch
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument('--split', default='train', choices=('train', 'val', 'test'),
                         help='which hands, poses and seeds (train)')
@@ -137,7 +137,7 @@ def _show(args: argparse.Namespace) -> None:
 
 
 def _relief(patch: NDArray[np.float32], label: str) -> Picture:
-    """A patch lit from the upper left, unsmoothed, so that its noise can be judged; nothing is dark."""
+    """A patch as a surface that is lit from the upper left. Nothing smooths it, so its noise can be judged."""
     import numpy as np
 
     from hand_pose_ros.drawing import caption

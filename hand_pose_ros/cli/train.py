@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_machine_arguments(parser: argparse.ArgumentParser) -> None:
-    """Values of the recipe, and where to train."""
+    """Add the values of the recipe, and where to train."""
     parser.add_argument('--set', action='append', default=[], metavar='KEY=VALUE', dest='overrides',
                         help='replace a value of the recipe; may be given several times')
     parser.add_argument('--device', default='cpu', help='cpu or cuda (default: %(default)s)')
@@ -59,7 +59,7 @@ def machine(args: argparse.Namespace) -> Any:
 
 
 def show_progress() -> None:
-    """Print what is logged, and let a second Ctrl-C, while Python cleans up after the first, end it without a word."""
+    """Print what is logged. A second Ctrl-C, while Python cleans up after the first one, ends the process silently."""
     import atexit
     import logging
     import signal
@@ -69,10 +69,10 @@ def show_progress() -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Train, or go on, and name the best weights.
+    """Train, or resume, and name the best weights.
 
     Raises:
-        HandPoseError: the recipe is none, or there is a run already, or none to go on with.
+        HandPoseError: there is no such recipe, there is a run already, or there is no run to resume.
     """
     from tqdm.contrib.logging import logging_redirect_tqdm
 

@@ -63,18 +63,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Show until the end of the bag, or until Ctrl-C; 1 if an image of the bag could not be used.
+    """Show until the end of the bag, or until Ctrl-C. Returns 1 if an image of the bag could not be used.
 
     Raises:
-        HandPoseError: Rerun is not installed, there is no ROS to be live with, or the bag cannot be read.
+        HandPoseError: Rerun is not installed, the bag cannot be read, or there is no ROS for live topics.
     """
     if args.bag is not None:
         refuse(args, ('transport', 'ros_args'), 'is for live topics')
         return _view_bag(args)
     refuse(args, (*(name for name in BAG if name not in ('intrinsics', 'depth_scale')), *ESTIMATOR, 'max_hands'),
-           'is for bags: which live topics are shown is said by --ros-args -r from:=to')
+           'is for bags: choose live topics with --ros-args -r from:=to')
     check_intrinsics(args)
-    from hand_pose_ros.ros.watch import watch  # says what is missing where there is no ROS
+    from hand_pose_ros.ros.watch import watch  # without ROS, this says what is missing
     with Scene(args.save) as scene:
         watch(scene.add_depth, scene.add_hands, args.transport, args.depth_scale or 0.001, args.intrinsics,
               args.ros_args)
@@ -109,7 +109,7 @@ class Scene:
     """Depth images as a cloud of points, and hands as markers among them, in the optical frame of the camera.
 
     Args:
-        path: of the .rrd file, which is there when the scene is left without an error; None opens the viewer.
+        path: the .rrd file to write. It appears when the scene is left without an error. None opens the viewer.
 
     Raises:
         HandPoseError: Rerun is not installed, there is no display, or the file cannot be written.
@@ -146,7 +146,7 @@ class Scene:
         self._stream.log('camera/depth', self._rerun.DepthImage(to_units(depth, 0.001), meter=1000.0))
 
     def add_hands(self, stamp_ns: int, hands: Sequence[HandEstimate], skeleton: Skeleton) -> None:
-        """Show the hands of an image, and take away those that are gone."""
+        """Show the hands of an image, and remove those that are gone."""
         self._at(stamp_ns)
         if self._markers is None:
             self._markers = HandMarkers(skeleton)

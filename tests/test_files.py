@@ -1,4 +1,4 @@
-"""Files are written in one step or not at all, also behind links, and what goes wrong is told with the file."""
+"""What files promise: they appear in one step, and what cannot be written is said with its name."""
 
 import os
 

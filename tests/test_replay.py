@@ -1,5 +1,7 @@
 """What `replay` promises: a bag on ROS topics as it was recorded. The real node, over real DDS."""
 
+# ruff: noqa: F811 (a fixture from another file is imported, and then an argument)
+
 import os
 import time
 from types import SimpleNamespace
@@ -18,7 +20,7 @@ from rosbags.typesys import Stores, get_typestore  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
 from sensor_msgs.msg import CameraInfo, Image  # noqa: E402
 from std_srvs.srv import SetBool  # noqa: E402
-from test_bags import CAMERA, STAMPS, write_ros1  # noqa: E402
+from test_bags import CAMERA, STAMPS, depths, write_ros1  # noqa: E402, F401 (depths is a fixture)
 
 from hand_pose_ros.bags import Bag, BagWriter, writer  # noqa: E402
 from hand_pose_ros.cli import main  # noqa: E402
@@ -30,12 +32,6 @@ from hand_pose_ros.ros.replay import SETTLE_S, Replay  # noqa: E402
 from hand_pose_ros.skeleton import HAND21  # noqa: E402
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-
-
-@pytest.fixture(scope='module')
-def depths():
-    units = np.random.default_rng(3).integers(0, 4000, (len(STAMPS), 48, 64), np.uint16)
-    return [image * np.float32(0.001) for image in units]
 
 
 @pytest.fixture

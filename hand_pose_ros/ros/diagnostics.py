@@ -35,6 +35,25 @@ class _Window:
     problem: str = ''
 
 
+class Complaints:
+    """Decides which problems are logged. Several threads may use it."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._logged_at: dict[str, float] = {}
+
+    def is_news(self, problem: str) -> bool:
+        """Whether to log a problem: once, and again after REPEAT_S. Other numbers in it make no new problem."""
+        kind, now = re.sub(r'\d+', '#', problem), time.monotonic()
+        with self._lock:
+            if now - self._logged_at.get(kind, -REPEAT_S) < REPEAT_S:
+                return False
+            if len(self._logged_at) >= MAX_KINDS:
+                self._logged_at.clear()
+            self._logged_at[kind] = now
+            return True
+
+
 class Statistics:
     """Counts (received, dropped, waited, refused, answered; camera_infos, hands) and times. Several threads may use it.
 
@@ -52,7 +71,6 @@ class Statistics:
         self._totals: Counter[str] = Counter()
         self._arriving: Counter[str] = Counter()
         self._arrived: Counter[str] = Counter()
-        self._logged_at: dict[str, float] = {}
 
     def count(self, **counts: int) -> None:
         """Add to the named counts."""
@@ -75,17 +93,6 @@ class Statistics:
         """Remember what is wrong, for the next report."""
         with self._lock:
             self._window.problem = text
-
-    def is_news(self, problem: str) -> bool:
-        """Whether to log a problem: once, and again after REPEAT_S. Other numbers in it make no new problem."""
-        kind, now = re.sub(r'\d+', '#', problem), time.monotonic()
-        with self._lock:
-            if now - self._logged_at.get(kind, -REPEAT_S) < REPEAT_S:
-                return False
-            if len(self._logged_at) >= MAX_KINDS:
-                self._logged_at.clear()
-            self._logged_at[kind] = now
-            return True
 
     def report(self, node: str, state: str, published: bool, facts: dict[str, str]) -> DiagnosticStatus:
         """The status for the time since the last report. This starts a new period.

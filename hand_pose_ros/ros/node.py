@@ -39,7 +39,7 @@ from hand_pose_ros.models.checkpoints import DEFAULT
 from hand_pose_ros.ros import params as parameters
 from hand_pose_ros.ros import qos, topics
 from hand_pose_ros.ros.camera import Camera, Closed
-from hand_pose_ros.ros.diagnostics import Statistics
+from hand_pose_ros.ros.diagnostics import Complaints, Statistics
 from hand_pose_ros.ros.outputs import Outputs
 from hand_pose_ros.ros.worker import NewestWorker
 
@@ -76,7 +76,7 @@ class EstimatorNode(LifecycleNode):
     """A lifecycle node that configures and activates itself unless the parameter `autostart` is false."""
 
     def __init__(self, **kwargs: Any) -> None:
-        self._statistics = Statistics()
+        self._statistics, self._complaints = Statistics(), Complaints()
         self._estimator: HandPoseEstimator | None = None
         self._worker: NewestWorker[Image | CompressedImage] | None = None
         self._inputs: list[Subscription] = []
@@ -92,7 +92,7 @@ class EstimatorNode(LifecycleNode):
         for name in parameters.unknown(self):
             if not name.startswith(QOS):
                 self.get_logger().warning(f"there is no parameter '{name}', so it has no effect: "
-                                          'hand-pose estimator --parameters lists those that there are')
+                                          'hand-pose estimator --parameters lists all')
         self.add_on_set_parameters_callback(self._on_parameters)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', qos.RESULTS)
         self.create_service(SetBool, '~/enable', self._on_enable)
@@ -290,7 +290,7 @@ class EstimatorNode(LifecycleNode):
         self._say(problem)
 
     def _say(self, problem: str) -> None:
-        if self._statistics.is_news(problem):
+        if self._complaints.is_news(problem):
             self.get_logger().warning(problem)
 
     # The worker

@@ -24,7 +24,7 @@ from hand_pose_ros.msg import HandJointsArray
 from hand_pose_ros.ros import qos, topics
 from hand_pose_ros.ros.camera import Camera
 from hand_pose_ros.ros.conversions import hand_from_msg
-from hand_pose_ros.ros.diagnostics import Statistics
+from hand_pose_ros.ros.diagnostics import Complaints
 from hand_pose_ros.ros.params import Params
 from hand_pose_ros.skeleton import Skeleton, get_skeleton
 
@@ -60,7 +60,7 @@ class _Watcher:
         fx, fy, cx, cy = intrinsics or (0.0, 0.0, 0.0, 0.0)
         self._params = Params(transport=transport, depth_scale=depth_scale, camera_info_timeout=0.0,
                               intrinsics_fx=fx, intrinsics_fy=fy, intrinsics_cx=cx, intrinsics_cy=cy)
-        self._statistics = Statistics()
+        self._complaints = Complaints()
         self._frame = ''
         self._topic, info_topic = topics.input_topics(self._node, transport)
         self._camera = Camera(info_topic, 'give --intrinsics FX FY CX CY')
@@ -107,5 +107,5 @@ class _Watcher:
             self._on_hands(stamp_ns(message.header), hands, skeleton)
 
     def _complain(self, problem: str) -> None:
-        if self._statistics.is_news(problem):
+        if self._complaints.is_news(problem):
             self._node.get_logger().warning(problem)

@@ -1,8 +1,8 @@
-"""Packs the wheel: setuptools takes the modules, CMakeLists.txt (the file that colcon runs) makes the messages.
+"""Builds the wheel. setuptools packs the modules. CMakeLists.txt, which colcon runs, too, builds the messages.
 
-The messages need ROS from wheels and a C++ compiler while building. Where they cannot be had the wheel is pure Python:
-library, training and evaluation work, and the node says what is missing. So does `pip install --no-build-isolation .`
-in an environment without ROS. Everything else stands in pyproject.toml.
+To build the messages, ROS from wheels and a C++ compiler are needed. Without them, the wheel is pure Python: library,
+training and evaluation work, and the node says what is missing. The same happens with `pip install
+--no-build-isolation .` in an environment without ROS. Everything else is in pyproject.toml.
 """
 
 import importlib.metadata
@@ -24,14 +24,14 @@ else:
 
 NAME = 'hand_pose_ros'
 ROOT = Path(__file__).resolve().parent
-# What CMakeLists.txt installs, too.
+# CMakeLists.txt installs the same.
 SHARE = ('package.xml', 'msg/*', 'config/*', 'demo/*', 'foxglove/*', 'launch/*.py', 'rviz/*')
 
 
 def can_build_messages() -> bool:
-    """Whether ROS is published as wheels for this Python and machine, a compiler is here, and no other ROS is in use.
+    """Whether there are ROS wheels for this Python and machine, a compiler is installed, and no other ROS is sourced.
 
-    Where another ROS is sourced the messages must be of its kind: building them is colcon's work.
+    If another ROS is sourced, the messages must be built for that one, which is the work of colcon.
     """
     sourced = [Path(folder) for folder in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep) if folder]
     return (
@@ -52,7 +52,7 @@ def ros_prefix() -> Path | None:
 
 
 class BuildMessages(Command):
-    """Runs CMakeLists.txt into a folder of its own and takes over the libraries, scripts and generated modules."""
+    """Runs CMakeLists.txt in a folder of its own, and takes libraries, scripts and generated modules from there."""
 
     description = 'generate and compile the messages'
     user_options = []  # noqa: RUF012 (setuptools names it)
@@ -75,7 +75,7 @@ class BuildMessages(Command):
         subprocess.run(configure, check=True, env=environment)
         subprocess.run(['cmake', '--build', tree, '--target', 'install'], check=True, env=environment)
 
-        # Libraries are opened by name, so they must lie in <environment>/lib; the index is what `ros2 run` looks into.
+        # Libraries are opened by name, so they must lie in <environment>/lib. `ros2 run` looks into the index.
         index = 'share/ament_index/resource_index'
         for pattern in ('lib/*.so', f'lib/{NAME}/*', f'{index}/packages/*', f'{index}/rosidl_interfaces/*'):
             for file in prefix.glob(pattern):
@@ -90,7 +90,7 @@ class BuildMessages(Command):
             else:
                 self.mkpath(str(self.build_lib / folder))
                 self.copy_file(str(file), str(self.build_lib / folder))
-        if self.editable_mode:  # setuptools means to do this itself, but asks the distribution by a wrong name
+        if self.editable_mode:  # setuptools should do this itself, but asks for it by a wrong name
             self.run_command('install_data')
 
     def get_source_files(self):

@@ -1,12 +1,12 @@
-"""Fingertips in real depth frames: how far beside the marks do the estimates lie?
+"""How far are estimated fingertips from the marked ones in real depth frames?
 
     python benchmarks/annotated_frames.py FRAMES --model hand_dense deep_prior --json results.json --overlays FOLDER
 
 FRAMES holds annotations.json: `frames`, each with sensor, file, width, height, fx, fy, cx, cy, depth_scale_m, side,
-`points` {joint: [u, v, depth_mm] or null} and `doubtful` [joints]. Every frame is treated as the first one the
-estimator sees, detection included. Errors are lateral, at the annotated depth, in mm, over all visible fingertips that
-are not doubtful; a frame without a hand misses all of its fingertips, and these count as farther than any distance.
-Milliseconds are the median of whole frames, from the array in metres to the joints.
+`points` {joint: [u, v, depth_mm] or null} and `doubtful` [joints]. Every frame is treated as the first one that the
+estimator sees, so the hand is searched in it. Errors are lateral, at the annotated depth, in mm, and of all visible
+fingertips that are not doubtful. If no hand is found in a frame, its errors are infinite. Milliseconds are the median
+of whole frames, from the array in metres to the joints.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def camera_of(frame: dict[str, Any]) -> Intrinsics:
 
 
 def tip_errors_mm(frame: dict[str, Any], hand: HandEstimate | None) -> dict[str, float]:
-    """Lateral error of each fingertip that is marked and clear; infinite without a hand."""
+    """Lateral error of each fingertip that is marked and not doubtful. Without a hand, it is infinite."""
     camera, errors = camera_of(frame), {}
     for name, mark in frame['points'].items():
         if mark is None or not name.endswith('_tip') or name in frame['doubtful']:
@@ -54,7 +54,7 @@ def main() -> None:
     parser.add_argument('--overlays', type=Path, help='write one sheet of all frames for each model here')
     parser.add_argument('--min-score', type=float, help='(that of the estimator)')
     parser.add_argument('--readings', type=int, default=hand_pose_ros.estimator.READINGS,
-                        help='how often a cube is read, where its joints are not in its middle (%(default)s)')
+                        help='how often a cube is read if its joints are not in its middle (%(default)s)')
     parser.add_argument('--detector', default='network', choices=('network', 'nearest'))
     parser.add_argument('--sides-known', action='store_true', help='tell the estimator whether it is a left hand')
     args = parser.parse_args()

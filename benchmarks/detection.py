@@ -1,10 +1,10 @@
-"""How often is a hand found in a whole image that shows nothing but the first moment? On synthetic test scenes.
+"""How often is a hand found in a single image, without tracking? Measured on synthetic test scenes.
 
     python benchmarks/detection.py --number 1000
 
-Tables, walls, people, held things and second hands are part of the scenes. Counted are images in which the whole hand
-is within the image and 0.15 to 1.4 m away; it is *found* if the first hand that is told has its middle within 50 mm of
-the true one, *elsewhere* if it has not (it may be a second hand). *Alarms*: images without a hand in which one is told.
+Tables, walls, people, held things and second hands are part of the scenes. Images with a hand count only if it is whole
+and 0.15 to 1.4 m away. It is *found* if the middle of the first estimate is within 50 mm of the true one. Otherwise,
+the estimate is *elsewhere* (it may be of a second hand). *Alarms* are images without a hand in which one is reported.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""What a CUDA GPU makes of the weights that ship: `python benchmarks/gpu.py`, one minute.
+"""How fast a CUDA GPU runs the weights that ship: `python benchmarks/gpu.py` takes one minute.
 
-For each network, in turn: the engine from array to array, its CUDA graph with the copies to and from pinned memory,
-the graph alone (copies left out, the mean of many replays in a row), and plain PyTorch on the GPU. Then hands a second
-of large batches, from float32 patches in host memory to joints there.
+Each network is timed in four ways, in turn: the engine from array to array, its CUDA graph with the copies to and from
+pinned memory, the graph alone (without copies, the mean of many replays in a row), and plain PyTorch on the GPU. Large
+batches follow, in hands per second, from float32 patches in host memory to joints there.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def graph_alone(engine: CudaEngine, replays: int = 500) -> float:
 
 
 def with_copies(engine: CudaEngine) -> Callable[[], None]:
-    """A replay as the engine does it, between two images: the input lies in pinned memory already."""
+    """A replay as the engine does it. The input is already in pinned memory."""
     captured = engine.captured_for(1)
 
     def call() -> None:

@@ -3,10 +3,10 @@
     python benchmarks/hand_size.py --number 700 --start 21200
     python benchmarks/hand_size.py --number 60 --start 22000 --frames 24
 
-Every image is read in cubes of 0.30 m, of 0.285 m, and of 0.30 m times the size of the hand over the usual one: the
-true size, the one that the network tells of the first cube, and the one that the estimator would believe after the
-earlier images of the same hand. Cubes stay within 0.25 to 0.36 m, which networks are trained for, and are centred as
-tracking would.
+Every image is read in cubes of 0.30 m, of 0.285 m, and of 0.30 m scaled by three sizes of the hand, relative to the
+usual one: the true size, the size that the network gives for the first cube, and the size that the estimator would
+believe after the earlier images of this hand. Cubes are limited to 0.25 to 0.36 m, for which networks are trained, and
+centred as by tracking.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@
 
 Each row is one setting: the rate, the reliability that the camera offers, and which of the two processes has the Fast
 DDS profile for large images. `lost` images were published and never answered. `node` says where the time goes inside
-of the node (its own medians, from /diagnostics); the rest is transport and waiting for the processor.
+of the node (its own medians, from /diagnostics). The rest is transport and waiting for the processor.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ WARM_UP = 15
 
 
 def main() -> int:
-    """Run every setting in processes of its own, for a profile is read once in the life of a process."""
+    """Run every setting in new processes, because a process reads the profile only once."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--json', type=Path, metavar='FILE', help='write the rows')
     parser.add_argument('--rates', nargs='+', type=float, default=[30.0], metavar='HZ')

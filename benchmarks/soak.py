@@ -4,9 +4,9 @@
     python benchmarks/soak.py --frames 2000 --cycles 10 --reloads 3 --kills 1
 
 The images are those of node_latency.py, each published when the one before it is answered. A cycle deactivates and
-activates the node, a reload also cleans it up and configures it, which loads the network again; an image is answered in
-between. Memory is the resident set of the node's process; `growth` is from the end of the warm-up, a twentieth of the
-images or cycles, to the end.
+activates the node. A reload also cleans it up and configures it, which loads the network again. After each of them, an
+image is answered. Memory is the resident set of the node's process. Its growth is measured from the end of the warm-up,
+a twentieth of the images or cycles, to the end.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class Rig:
         return False
 
     def wait_until_it_answers(self) -> float:
-        """Publish at the rate of a camera until there is an answer; seconds that it took."""
+        """Publish at the rate of a camera until there is an answer. Returns the seconds that it took."""
         start, first = time.perf_counter(), self._sent + 1
         while not self.wait(first, 1 / RATE_HZ):
             if time.perf_counter() - start > START_S:
@@ -116,7 +116,7 @@ class Rig:
         """Resident memory [kB], threads and open files of the node."""
         assert self.process is not None
         files = Path(f'/proc/{self.process.pid}')
-        rollup = (files / 'smaps_rollup').read_text()  # exact, where status counts up to 64 pages a thread too few
+        rollup = (files / 'smaps_rollup').read_text()  # exact; status counts up to 64 pages per thread too few
         return {'resident_kb': int(rollup.split('Rss:')[1].split()[0]), 'threads': len(os.listdir(files / 'task')),
                 'files': len(os.listdir(files / 'fd'))}
 
@@ -153,7 +153,7 @@ def growth(samples: list[dict[str, int]]) -> dict[str, Any]:
 
 
 def soak(rig: Rig, frames: int) -> dict[str, Any]:
-    """As many images as fast as they are answered."""
+    """Publish this many images, each as soon as the one before it is answered."""
     samples, lost, start = [], 0, time.perf_counter()
     for i in tqdm(range(frames), unit='image', disable=None):
         lost += not rig.wait(rig.publish(), PATIENCE_S)
@@ -165,7 +165,7 @@ def soak(rig: Rig, frames: int) -> dict[str, Any]:
 
 
 def cycle(rig: Rig, cycles: int, *transitions: str) -> dict[str, Any]:
-    """The transitions again and again, with an answer in between."""
+    """Make the transitions again and again, with an answer in between."""
     samples = []
     for i in tqdm(range(cycles), unit='cycle', disable=None):
         for label in transitions:
@@ -178,7 +178,7 @@ def cycle(rig: Rig, cycles: int, *transitions: str) -> dict[str, Any]:
 
 
 def kill(rig: Rig) -> float:
-    """kill -9 under load and a new process at once: seconds from its start to the first joints."""
+    """Kill the node under load, and start it again at once. Returns the seconds from its start to the first joints."""
     for _ in range(30):
         rig.wait(rig.publish(), 1 / RATE_HZ)
     rig.stop(signal.SIGKILL)

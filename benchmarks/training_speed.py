@@ -1,7 +1,7 @@
 """Samples per second that one core, or a GPU, renders, augments and trains on: `python benchmarks/training_speed.py`.
 
-Of a core the time of the process is taken and not of the clock, so the numbers hold on a machine that is busy with
-other things. On a GPU (`--device cuda`) batches are large, 1,024 samples and 2,048 to render, and a step is a graph.
+On a core, the time of the process is measured, not that of the clock. So the numbers also hold on a busy machine. On a
+GPU (`--device cuda`), a batch has 1,024 samples (2,048 to render), and a step is a CUDA graph.
 """
 
 from __future__ import annotations

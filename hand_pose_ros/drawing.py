@@ -32,13 +32,13 @@ _NOTHING = (28, 24, 24)
 
 def shade(depth: NDArray[np.float32], intrinsics: Intrinsics, near: float | None = None,
           far: float | None = None) -> Picture:
-    """A depth image (H, W) in metres as a lit surface, so that fingers can be told apart; no reading is dark.
+    """A depth image (H, W) in metres as a lit surface, so that fingers can be told apart. No reading is dark.
 
     Args:
-        depth: what is not finite counts as no reading, as 0 does.
-        near, far: metres over which the tint goes from bright to dark; by default the range of the image.
+        depth: 0, NaN and infinite = no reading.
+        near, far: the tint goes from bright to dark between them, metres; by default the range of the image.
     """
-    depth = np.asarray(depth, np.float32)  # OpenCV filters no other
+    depth = np.asarray(depth, np.float32)  # OpenCV filters no other type
     valid = (depth > 0) & np.isfinite(depth)
     if not valid.any():
         return np.full((*depth.shape, 3), _NOTHING, np.uint8)
@@ -92,13 +92,13 @@ def draw_cube(picture: Picture, cube: Cube, intrinsics: Intrinsics) -> None:
 
 def overlay(depth: NDArray[np.float32], intrinsics: Intrinsics, hands: Sequence[HandEstimate],
             skeleton: Skeleton = HAND21, height: int = 480) -> Picture:
-    """The whole image with its hands, and beside it each hand alone, close up.
+    """The whole image with its hands, and beside it a close-up of each hand.
 
     Args:
-        depth: (H, W) metres; 0, NaN and infinite = no reading.
+        depth: (H, W) metres. 0, NaN and infinite = no reading.
         height: of the picture, pixels.
     """
-    width = np.clip(depth.shape[1] * height / depth.shape[0], height / 4, 16 * height)  # of one row, it had no end
+    width = np.clip(depth.shape[1] * height / depth.shape[0], height / 4, 16 * height)  # one row would be endless
     whole = _View(depth, intrinsics, (0, 0), (depth.shape[1], depth.shape[0]), (round(width), height))
     picture = whole.shade()
     for hand in hands:
@@ -126,7 +126,7 @@ def close_up(depth: NDArray[np.float32], intrinsics: Intrinsics, cube: Cube, joi
 
 
 def contact_sheet(pictures: Sequence[Picture], columns: int = 4) -> Picture:
-    """Pictures of any size in a grid, in reading order; each cell is as large as the largest picture."""
+    """Pictures of any size in a grid, in reading order. Each cell is as large as the largest picture."""
     height, width = (max(picture.shape[axis] for picture in pictures) for axis in (0, 1))
     columns = min(columns, len(pictures))
     rows = -(-len(pictures) // columns)
@@ -152,7 +152,7 @@ class _View:
                                      intrinsics.cy * b + matrix[1, 2], width, height)
 
     def shade(self, near: float | None = None, far: float | None = None) -> Picture:
-        """The shaded surface; it is lit before it is enlarged, or every pixel would be a terrace."""
+        """The shaded surface. It is lit before it is enlarged, because each enlarged pixel would be a terrace."""
         lit = shade(self._depth, self._original, near, far)
         return np.asarray(cv2.warpAffine(lit, self._matrix, self._size, flags=cv2.INTER_LINEAR,
                                          borderValue=_NOTHING), np.uint8)
@@ -176,7 +176,7 @@ def _dot(picture: Picture, center: NDArray[np.float64], radius: float, color: tu
 
 
 def caption(picture: Picture, text: str, at: tuple[int, int] = (10, 24), size: float = 0.7) -> None:
-    """Write into the upper left corner of a picture, to be read on anything."""
-    around = [((x, y), (0, 0, 0)) for x in (-1, 0, 1) for y in (-1, 0, 1)]  # a thick outline has wider letters
+    """Write white letters with a black outline into the upper left corner of a picture."""
+    around = [((x, y), (0, 0, 0)) for x in (-1, 0, 1) for y in (-1, 0, 1)]  # thicker letters are wider
     for (x, y), color in (*around, ((0, 0), (255, 255, 255))):
         cv2.putText(picture, text, (at[0] + x, at[1] + y), cv2.FONT_HERSHEY_SIMPLEX, size, color, 1, cv2.LINE_AA)

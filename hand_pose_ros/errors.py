@@ -18,7 +18,7 @@ class CheckpointError(HandPoseError):
 
 @contextmanager
 def naming(source: object) -> Iterator[None]:
-    """Begin the message of an InputError with the topic or file it is about; `source` may be empty."""
+    """Begin the message of an InputError with the topic or file that it is about, unless `source` is empty."""
     try:
         yield
     except InputError as error:

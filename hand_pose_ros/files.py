@@ -15,9 +15,9 @@ from hand_pose_ros.errors import InputError
 
 @contextmanager
 def in_one_step(path: str | Path) -> Iterator[Path]:
-    """A file beside `path` to write to, which becomes `path` when the block ends; after an error nothing is left.
+    """A file beside `path` to write to. It becomes `path` when the block ends. After an error, nothing is left.
 
-    A link stays one, and its target is replaced. A device or FIFO (/dev/stdout) is written to directly.
+    If `path` is a link, its target is replaced. A device or FIFO (/dev/stdout) is written to directly.
 
     Raises:
         InputError: the folder cannot be made or written, or the disk is full.
@@ -39,34 +39,34 @@ def in_one_step(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def naming_full_disk(path: str | Path) -> Iterator[None]:
-    """Raise InputError with the name of the file if what is done ends because a disk is full, or takes no such file."""
+    """Raise InputError with the name of the file if the block ends because a disk is full, or cannot take the file."""
     try:
         yield
-    except Exception as error:  # libraries say it with exceptions of their own
+    except Exception as error:  # libraries raise exceptions of their own
         if re.search('No space left|disk is full|quota exceeded', str(error), re.IGNORECASE):
             raise InputError(f'{path}: cannot be written, for the disk is full: make room, or choose another place'
                              ) from error
-        # As with 4 GB on FAT, with ulimit -f, or with a disk that was pulled out; SQLite calls all of it an I/O error.
+        # Causes are 4 GB on FAT, ulimit -f, or a disk that was pulled out. SQLite calls all of them an I/O error.
         if re.search('File too large|Input/output error|disk I/O error', str(error)):
             raise InputError(f'{path}: cannot be written ({error}): choose another place') from error
         raise
 
 
 def check_writable(path: str | Path) -> None:
-    """Raise InputError if there can be no such file: before the work whose result it is to hold."""
+    """Raise InputError if the file cannot be written. Call this before the work."""
     if not _is_device(path):
         _begin(Path(os.path.realpath(path))).unlink()
 
 
 def _is_device(path: str | Path) -> bool:
-    """Whether it is written to where it is, as devices and FIFOs are."""
+    """Whether there is a device or a FIFO, which is not replaced but written to."""
     return Path(path).exists() and not Path(path).is_file() and not Path(path).is_dir()
 
 
 def _begin(path: Path) -> Path:
     """An empty file beside `path`."""
     if path.is_dir():
-        raise InputError(f'{path}: is a folder: give the name of a file')
+        raise InputError(f'{path} is a folder: give the name of a file')
     part = path.with_name(f'.{path.name}.{os.getpid()}.part')
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -34,11 +34,11 @@ _EDGES = np.array([(a, b) for a, b in combinations(_CORNERS, 2)
 
 @dataclass(frozen=True)
 class Marker:
-    """One visualization_msgs/Marker; its pose is the identity.
+    """One visualization_msgs/Marker. Its pose is the identity.
 
     Attributes:
         namespace: with it, a later marker replaces or deletes this one.
-        action: ADD or DELETE; the rest is of ADD only.
+        action: ADD or DELETE. All that follows is for ADD.
         type: SPHERE_LIST, or LINE_LIST with two points for each line.
         scale: diameter along x, y and z, or width of the lines in x; metres.
         points: (N, 3) metres, in the frame of the image.
@@ -54,16 +54,16 @@ class Marker:
 
 
 class HandMarkers:
-    """Markers of consecutive images; remembers what it has shown, so that a lost hand is deleted at once.
+    """Markers of consecutive images. A lost hand is deleted at once.
 
-    Deleting only what is gone, instead of everything in each message, is what keeps viewers from flickering.
+    Only what is gone is deleted. If each message deleted everything, viewers would flicker.
     """
 
     def __init__(self, skeleton: Skeleton) -> None:
         self._shown: set[str] = set()
         self._bones = np.array(skeleton.bones).reshape(-1)
         self._joint_colors = tuple(_color(FINGER_COLORS[finger]) for finger in skeleton.fingers)
-        # A bone belongs to the finger at its far end: the one from the wrist to the thumb is the thumb's.
+        # A bone belongs to the finger at its far end, for example that from the wrist to the thumb.
         self._bone_colors = tuple(self._joint_colors[child] for _, child in skeleton.bones for _ in range(2))
 
     def update(self, hands: Sequence[HandEstimate]) -> list[Marker]:

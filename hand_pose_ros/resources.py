@@ -18,7 +18,7 @@ def share_folder() -> Path:
     for folder in (package.parent, *(prefix / 'share' / package.name for prefix in package.parents)):
         if (folder / 'package.xml').is_file():
             return folder
-    raise HandPoseError(f"No share/{package.name} with the package's files was found above {package}: reinstall it.")
+    raise HandPoseError(f'there is no share/{package.name} with the files of the package above {package}: reinstall it')
 
 
 def resource(name: str) -> Path:
@@ -32,5 +32,5 @@ def resource(name: str) -> Path:
     """
     path = share_folder() / name
     if not path.is_file():
-        raise HandPoseError(f'{path} does not exist: reinstall the package with pip or colcon.')
+        raise HandPoseError(f'{path} does not exist: reinstall the package with pip or colcon')
     return path

@@ -29,11 +29,12 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def _nodes(context: LaunchContext) -> list[Node]:
-    """A parameter that is passed on beats params_file, so use_sim_time is passed on only if it was given."""
+    """use_sim_time is passed on only if it was given, because it would override that of params_file."""
     use_sim_time = LaunchConfiguration('use_sim_time')
     given = [{'use_sim_time': use_sim_time}] if use_sim_time.perform(context) else []
     depth_topic = LaunchConfiguration('depth_topic')
-    camera_info = str(Path(depth_topic.perform(context)).with_name('camera_info'))  # which RViz does not take along
+    # RViz does not remap it along with the image.
+    camera_info = str(Path(depth_topic.perform(context)).with_name('camera_info'))
     return [
         Node(package='hand_pose_ros', executable='estimator', name='estimator', output='screen',
              namespace=LaunchConfiguration('namespace'),

@@ -103,8 +103,8 @@ class Bag:
         except Exception as error:  # random bytes can cause any error
             self._check_open()
             if bytes(data[:4]) == b'\x28\xb5\x2f\xfd':  # zstd; only metadata.yaml says that messages are compressed
-                raise InputError(f'{self.path}: its messages are compressed, as metadata.yaml says: give the folder '
-                                 'that holds both, or make it anew with: ros2 bag reindex FOLDER') from error
+                raise InputError(f'{self.path}: its messages are compressed, which only metadata.yaml says: give the '
+                                 'folder that holds both, or make that file with ros2 bag reindex FOLDER') from error
             raise InputError(f'{self.path}: a message on {connection.topic} is damaged ({_said(error)}): record or '
                              'copy the bag again') from error
 

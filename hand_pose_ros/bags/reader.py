@@ -239,7 +239,7 @@ def check_frame(source: str, hands: str, images: str) -> None:
     """Raise InputError if hands and images are in different frames. A frame without a name may be any frame."""
     if hands and images and hands != images:
         raise InputError(f"{source}: its joints are in frame '{hands}', but the images in '{images}': leave the "
-                         'target_frame of the node empty, and it publishes them where the camera sees them')
+                         'parameter target_frame of the node empty')
 
 
 def _recorded_hands(message: Any, source: str) -> RecordedHands:

@@ -2,7 +2,9 @@
 
 import itertools
 import os
+import socket
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -11,7 +13,7 @@ import pytest
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 
 _CHECKOUT = Path(__file__).resolve().parents[1]
-_domain = itertools.count(os.getpid())
+_numbers = itertools.count(os.getpid())
 
 
 @pytest.fixture(scope='session')
@@ -24,17 +26,20 @@ def shared_data() -> Path:
 
 
 @pytest.fixture
-def ros_domain(monkeypatch: pytest.MonkeyPatch) -> int:
-    """A ROS_DOMAIN_ID that no other test uses at the same time, on this machine only; returned and in the environment.
+def ros_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
+    """A ROS_DOMAIN_ID that no other test on this machine uses at the same time; also in the environment.
 
     Ask for it before rclpy.init(), or for a whole file: `pytestmark = pytest.mark.usefixtures("ros_domain")`.
     """
-    worker = int(os.environ.get('PYTEST_XDIST_WORKER', 'gw0').removeprefix('gw'))
-    workers = int(os.environ.get('PYTEST_XDIST_WORKER_COUNT', '1'))
-    domain = 1 + (next(_domain) * workers + worker) % 100  # above 101 the ports meet the ephemeral ones
-    monkeypatch.setenv('ROS_DOMAIN_ID', str(domain))
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    return domain
+    with socket.socket() as lock:
+        for number in _numbers:
+            domain = 1 + number % 100  # above 101 the ports meet the ephemeral ones
+            with suppress(OSError):  # another test has this domain
+                lock.bind(('127.0.0.1', 7400 + 250 * domain))  # over TCP, DDS does not use its port
+                break
+        monkeypatch.setenv('ROS_DOMAIN_ID', str(domain))
+        yield domain
 
 
 @pytest.fixture(scope='module')

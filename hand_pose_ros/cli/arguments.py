@@ -6,11 +6,14 @@ import argparse
 import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hand_pose_ros.errors import HandPoseError, naming
 from hand_pose_ros.files import check_writable
 from hand_pose_ros.geometry import Intrinsics
+
+if TYPE_CHECKING:
+    from hand_pose_ros.estimator import HandPoseEstimator
 
 
 def count(text: str) -> int:
@@ -130,3 +133,10 @@ def estimator_options(args: argparse.Namespace) -> dict[str, Any]:
     """The arguments of `add_estimator` without model and device, for `HandPoseEstimator.from_pretrained`."""
     given = {'side': args.side, 'detector': args.detector, 'cube_side': args.cube_size, 'min_score': args.min_score}
     return {name: value for name, value in given.items() if value is not None}
+
+
+def make_estimator(args: argparse.Namespace) -> HandPoseEstimator:
+    """The estimator with the arguments of `add_estimator` and --max-hands."""
+    from hand_pose_ros.estimator import HandPoseEstimator  # imports torch: not for --help and bad arguments
+    return HandPoseEstimator.from_pretrained(args.model, device=args.device, max_hands=args.max_hands,
+                                             **estimator_options(args))

@@ -24,8 +24,8 @@ from hand_pose_ros.cli.arguments import (
     bag_options,
     check_intrinsics,
     count,
-    estimator_options,
     keep_input,
+    make_estimator,
     refuse,
 )
 from hand_pose_ros.cli.hand_bag import HandBag
@@ -79,9 +79,7 @@ def run(args: argparse.Namespace) -> int:
     keep_input(args.overlay, args.input.parent if args.input.suffix.lower() == '.png' else args.input)
     with ExitStack() as stack:
         images, number = _open(args, stack)
-        from hand_pose_ros.estimator import HandPoseEstimator  # imports torch: not for --help and bad arguments
-        estimator = HandPoseEstimator.from_pretrained(args.model, device=args.device, max_hands=args.max_hands,
-                                                      **estimator_options(args))
+        estimator = make_estimator(args)
         sinks: list[_Sink] = []
         if args.overlay:
             sinks.append(_Overlays(args.overlay, estimator.skeleton))

@@ -106,21 +106,7 @@ def run(args: argparse.Namespace) -> int:
     if not recorded:
         refuse(args, ('root', 'split'), 'is for nyu, icvl and msra')
     if recorded or args.bags == ['synthetic-test-v1']:
-        refuse(args, ('side', 'detector', 'cube_size', 'min_score', 'ground_truth', 'depth_topic', 'camera_info_topic',
-                      'intrinsics', 'depth_scale', 'out_bag', 'via_ros', 'jobs'),
-               f'is for bags: crops, sides and truth are those of {args.bags[0]}')
-        if recorded and args.root is None:
-            args.parser.error(f'{args.bags[0]} is read from disk: give its folder with --root')
-        others = [published.load_result(source) for source in args.compare]
-        if recorded:
-            from hand_pose_ros.evaluation.dataset_evaluation import evaluate_dataset
-            result = evaluate_dataset(args.bags[0], args.root, args.model, args.split or 'test', args.device,
-                                      _progress('batches'))
-        else:
-            from hand_pose_ros.evaluation.benchmark_evaluation import evaluate_benchmark
-            result = evaluate_benchmark(args.model, args.device, progress=_progress('batches'))
-        _deliver(result, others, None, args.json, args.out, args.report, args.compare)
-        return 0
+        return _run_dataset(args, args.bags[0], recorded)
     return _run_bag(args) if len(args.bags) == 1 else _run_bags(args)
 
 
@@ -146,6 +132,23 @@ def _run_text(args: argparse.Namespace) -> int:
     others = [published.load_result(source, args.ground_truth, dataset) for source in args.compare]
     read_depths = partial(tompson.read_nyu_depths, args.depth_folder) if args.depth_folder else None
     _deliver(result, others, read_depths, args.json, args.out, args.report, args.compare)
+    return 0
+
+
+def _run_dataset(args: argparse.Namespace, name: str, recorded: bool) -> int:
+    refuse(args, ('side', 'detector', 'cube_size', 'min_score', 'ground_truth', 'depth_topic', 'camera_info_topic',
+                  'intrinsics', 'depth_scale', 'out_bag', 'via_ros', 'jobs'),
+           f'is for bags: crops, sides and truth are those of {name}')
+    if recorded and args.root is None:
+        args.parser.error(f'{name} is read from disk: give its folder with --root')
+    others = [published.load_result(source) for source in args.compare]
+    if recorded:
+        from hand_pose_ros.evaluation.dataset_evaluation import evaluate_dataset
+        result = evaluate_dataset(name, args.root, args.model, args.split or 'test', args.device, _progress('batches'))
+    else:
+        from hand_pose_ros.evaluation.benchmark_evaluation import evaluate_benchmark
+        result = evaluate_benchmark(args.model, args.device, progress=_progress('batches'))
+    _deliver(result, others, None, args.json, args.out, args.report, args.compare)
     return 0
 
 

@@ -22,8 +22,8 @@ from hand_pose_ros.cli.arguments import (
     bag_options,
     check_intrinsics,
     count,
-    estimator_options,
     keep_input,
+    make_estimator,
     refuse,
 )
 from hand_pose_ros.cli.estimate import from_bag
@@ -85,9 +85,7 @@ def _view_bag(args: argparse.Namespace) -> int:
     failed = shown = 0
     keep_input(args.save, args.bag)
     with DepthBag(args.bag, **bag_options(args)) as bag:
-        from hand_pose_ros.estimator import HandPoseEstimator  # imports torch: not for --help and bad arguments
-        estimator = HandPoseEstimator.from_pretrained(args.model, device=args.device, max_hands=args.max_hands,
-                                                      **estimator_options(args))
+        estimator = make_estimator(args)
         with Scene(args.save) as scene:
             for image in from_bag(bag):
                 try:

@@ -20,26 +20,27 @@ import pytest
 from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
-rclpy = pytest.importorskip('rclpy', reason='needs ROS 2')
+pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
 
-from rclpy.parameter import Parameter  # noqa: E402
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image, RegionOfInterest  # noqa: E402
-from visualization_msgs.msg import MarkerArray  # noqa: E402
+import rclpy
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, RegionOfInterest
+from visualization_msgs.msg import MarkerArray
 
-from hand_pose_ros.depth import (  # noqa: E402
+from hand_pose_ros.depth import (
     DEPTH_ENCODINGS,
     decode_compressed,
     decode_image,
     encode_rvl,
 )
-from hand_pose_ros.errors import InputError  # noqa: E402
-from hand_pose_ros.models import build  # noqa: E402
-from hand_pose_ros.models.checkpoints import save_checkpoint  # noqa: E402
-from hand_pose_ros.msg import HandJointsArray  # noqa: E402
-from hand_pose_ros.ros.camera import Camera  # noqa: E402
-from hand_pose_ros.ros.node import EstimatorNode  # noqa: E402
-from hand_pose_ros.ros.params import Params  # noqa: E402
+from hand_pose_ros.errors import InputError
+from hand_pose_ros.models import build
+from hand_pose_ros.models.checkpoints import save_checkpoint
+from hand_pose_ros.msg import HandJointsArray
+from hand_pose_ros.ros.camera import Camera
+from hand_pose_ros.ros.node import EstimatorNode
+from hand_pose_ros.ros.params import Params
 
 FUZZ = settings(max_examples=int(os.environ.get('HAND_POSE_FUZZ', '200')), deadline=None,
                 suppress_health_check=list(HealthCheck))

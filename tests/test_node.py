@@ -16,34 +16,35 @@ import numpy as np
 import pytest
 import torch
 
-rclpy = pytest.importorskip('rclpy', reason='needs ROS 2')
+pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
 
-from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
-from lifecycle_msgs.msg import Transition  # noqa: E402
-from lifecycle_msgs.srv import ChangeState, GetState  # noqa: E402
-from rcl_interfaces.msg import Log  # noqa: E402
-from rclpy.executors import SingleThreadedExecutor  # noqa: E402
-from rclpy.node import Node  # noqa: E402
-from rclpy.parameter import Parameter  # noqa: E402
-from rclpy.parameter_client import AsyncParameterClient  # noqa: E402
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
-from rclpy.task import Future  # noqa: E402
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image  # noqa: E402
-from std_srvs.srv import SetBool, Trigger  # noqa: E402
-from visualization_msgs.msg import Marker, MarkerArray  # noqa: E402
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.msg import Log
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.task import Future
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_srvs.srv import SetBool, Trigger
+from visualization_msgs.msg import Marker, MarkerArray
 
-from hand_pose_ros import estimator as estimator_module  # noqa: E402
-from hand_pose_ros.depth import encode_compressed  # noqa: E402
-from hand_pose_ros.models import build  # noqa: E402
-from hand_pose_ros.models.checkpoints import save_checkpoint  # noqa: E402
-from hand_pose_ros.msg import HandJointsArray, HandSkeleton  # noqa: E402
-from hand_pose_ros.ros import conversions  # noqa: E402
-from hand_pose_ros.ros import node as node_module  # noqa: E402
-from hand_pose_ros.ros.node import EstimatorNode  # noqa: E402
-from hand_pose_ros.ros.topics import input_topics  # noqa: E402
-from hand_pose_ros.ros.worker import NewestWorker  # noqa: E402
-from hand_pose_ros.skeleton import HAND21  # noqa: E402
+from hand_pose_ros import estimator as estimator_module
+from hand_pose_ros.depth import encode_compressed
+from hand_pose_ros.models import build
+from hand_pose_ros.models.checkpoints import save_checkpoint
+from hand_pose_ros.msg import HandJointsArray, HandSkeleton
+from hand_pose_ros.ros import conversions
+from hand_pose_ros.ros import node as node_module
+from hand_pose_ros.ros.node import EstimatorNode
+from hand_pose_ros.ros.topics import input_topics
+from hand_pose_ros.ros.worker import NewestWorker
+from hand_pose_ros.skeleton import HAND21
 
 pytestmark = pytest.mark.usefixtures('ros_domain')
 

@@ -9,27 +9,28 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-rclpy = pytest.importorskip('rclpy', reason='needs ROS 2')
+pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
 
-from rclpy.executors import SingleThreadedExecutor  # noqa: E402
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
-from rosbags.interfaces import QosReliability  # noqa: E402
-from rosbags.rosbag1 import Writer as Writer1  # noqa: E402
-from rosbags.typesys import Stores, get_typestore  # noqa: E402
-from rosgraph_msgs.msg import Clock  # noqa: E402
-from sensor_msgs.msg import CameraInfo, Image  # noqa: E402
-from std_srvs.srv import SetBool  # noqa: E402
-from test_bags import CAMERA, STAMPS, depths, write_ros1  # noqa: E402, F401 (depths is a fixture)
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosbags.interfaces import QosReliability
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.typesys import Stores, get_typestore
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CameraInfo, Image
+from std_srvs.srv import SetBool
+from test_bags import CAMERA, STAMPS, depths, write_ros1  # noqa: F401 (depths is a fixture)
 
-from hand_pose_ros.bags import Bag, BagWriter, writer  # noqa: E402
-from hand_pose_ros.cli import main  # noqa: E402
-from hand_pose_ros.depth import decode_image  # noqa: E402
-from hand_pose_ros.errors import InputError  # noqa: E402
-from hand_pose_ros.msg import HandJointsArray, HandSkeleton  # noqa: E402
-from hand_pose_ros.ros import qos  # noqa: E402
-from hand_pose_ros.ros.replay import SETTLE_S, Replay  # noqa: E402
-from hand_pose_ros.skeleton import HAND21  # noqa: E402
+from hand_pose_ros.bags import Bag, BagWriter, writer
+from hand_pose_ros.cli import main
+from hand_pose_ros.depth import decode_image
+from hand_pose_ros.errors import InputError
+from hand_pose_ros.msg import HandJointsArray, HandSkeleton
+from hand_pose_ros.ros import qos
+from hand_pose_ros.ros.replay import SETTLE_S, Replay
+from hand_pose_ros.skeleton import HAND21
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 

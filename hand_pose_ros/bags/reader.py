@@ -75,7 +75,7 @@ class DepthBag(Bag):
         depth_topic: a topic of sensor_msgs/Image or CompressedImage; not needed if only one topic carries depth.
         camera_info_topic: by default `camera_info` beside the depth topic.
         intrinsics: (fx, fy, cx, cy) in pixels, used instead of the camera_info.
-        depth_scale: metres per unit of 16-bit depth; by default 0.001.
+        depth_scale: metres per unit of 16-bit depth.
 
     Raises:
         InputError: the bag cannot be read, has no depth topic, or several to choose from, or has no camera_info.
@@ -83,7 +83,7 @@ class DepthBag(Bag):
 
     def __init__(self, path: str | os.PathLike[str], depth_topic: str | None = None,
                  camera_info_topic: str | None = None, intrinsics: tuple[float, float, float, float] | None = None,
-                 depth_scale: float | None = None) -> None:
+                 depth_scale: float = 0.001) -> None:
         super().__init__(path)
         try:
             self.depth_topic = depth_topic or self._find_depth_topic()
@@ -97,8 +97,7 @@ class DepthBag(Bag):
         except InputError:
             self.close()
             raise
-        self._intrinsics = intrinsics or ()
-        self._depth_scale = 0.001 if depth_scale is None else depth_scale
+        self._intrinsics, self._depth_scale = intrinsics or (), depth_scale
         self._unusable = ''
 
     def __len__(self) -> int:

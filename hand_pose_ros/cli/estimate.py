@@ -169,7 +169,7 @@ def _open(args: argparse.Namespace, stack: ExitStack) -> tuple[Iterator[DepthInp
         check_intrinsics(args)
         for path in paths:  # any of them may be a link into the folder of the pictures
             keep_input(args.overlay and args.overlay / f'{path.stem}.png', path)
-        return _from_pngs(paths, args.intrinsics, args.depth_scale or 0.001), len(paths)
+        return _from_pngs(paths, args.intrinsics, args.depth_scale), len(paths)
     bag = stack.enter_context(DepthBag(args.input, **bag_options(args)))
     return from_bag(bag), len(bag)
 

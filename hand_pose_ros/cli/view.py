@@ -76,8 +76,7 @@ def run(args: argparse.Namespace) -> int:
     check_intrinsics(args)
     from hand_pose_ros.ros.watch import watch  # without ROS, this says what is missing
     with Scene(args.save) as scene:
-        watch(scene.add_depth, scene.add_hands, args.transport, args.depth_scale or 0.001, args.intrinsics,
-              args.ros_args)
+        watch(scene.add_depth, scene.add_hands, args.transport, args.depth_scale, args.intrinsics, args.ros_args)
     return 0
 
 

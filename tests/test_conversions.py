@@ -30,7 +30,7 @@ from hand_pose_ros.resources import resource
 from hand_pose_ros.ros import topics
 from hand_pose_ros.ros.camera import Camera, Closed
 from hand_pose_ros.ros.conversions import hand_from_msg, hands_to_msg, markers_to_msg, skeleton_to_msg
-from hand_pose_ros.ros.diagnostics import MAX_AGE_S, MAX_KINDS, REPEAT_S, Statistics
+from hand_pose_ros.ros.diagnostics import MAX_AGE_S, MAX_KINDS, REPEAT_S, Complaints, Statistics
 from hand_pose_ros.ros.params import Params, markdown_table, yaml_file
 from hand_pose_ros.skeleton import HAND21
 
@@ -325,13 +325,13 @@ def test_lost_images_of_a_slow_camera_are_told() -> None:
 def test_a_complaint_is_repeated_after_a_while_whatever_its_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
     now = 3.0  # the machine has just started
     monkeypatch.setattr('hand_pose_ros.ros.diagnostics.time', SimpleNamespace(monotonic=lambda: now))
-    statistics = Statistics()
-    assert statistics.is_news('5 bytes are missing') and statistics.is_news('no readings')
+    complaints = Complaints()
+    assert complaints.is_news('5 bytes are missing') and complaints.is_news('no readings')
     now += REPEAT_S - 1
-    assert not statistics.is_news('17 bytes are missing')
+    assert not complaints.is_news('17 bytes are missing')
     now += 2
-    assert statistics.is_news('17 bytes are missing')
-    assert all(statistics.is_news('x' * i) for i in range(1, 3 * MAX_KINDS)) and len(statistics._logged_at) <= MAX_KINDS
+    assert complaints.is_news('17 bytes are missing')
+    assert all(complaints.is_news('x' * i) for i in range(1, 3 * MAX_KINDS)) and len(complaints._logged_at) <= MAX_KINDS
 
 
 def test_a_report_tells_rates_times_and_the_worst_problem(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1095,7 +1095,7 @@ def test_experiments_train_what_is_missing_and_write_table_plot_and_json(folder,
 def test_an_experiment_that_leaves_nothing_for_the_refiner_is_refused_at_once(folder, tmp_path, capsys):
     sets = [part for item in (*TINY, f'root={folder}', 'samples=24') for part in ('--set', item)]
     assert main(['experiment', 'joints', '--out', str(tmp_path), '--workers', '0', *sets]) == 1
-    assert 'some of the 4 shards of icvl-train, for example with --set last_shard=3' in capsys.readouterr().err
+    assert 'some of the 4 shards of icvl-train to it, for example with --set last_shard=3' in capsys.readouterr().err
     assert main(['experiment', 'ingredients', '--out', str(tmp_path), '--workers', '0', *sets]) == 1
     assert '--set dataset=icvl: only synthetic hands have ingredients to leave out' in capsys.readouterr().err
     assert not (tmp_path / 'runs').exists()

@@ -94,14 +94,15 @@ class CudaEngine(Engine):
 
     def _capture(self, size: int) -> _Captured:
         source = torch.ones(size, 1, PATCH_SIZE, PATCH_SIZE, dtype=self.pipeline.precision, pin_memory=True)
-        with torch.inference_mode(), torch.cuda.device(self.device), exact_convolutions():
-            with torch.cuda.stream(self.stream):
-                for _ in range(WARM_UP):
-                    answer = self._compute(source)
-                targets = tuple(torch.empty(tensor.shape, pin_memory=True) for tensor in answer)
-            self.stream.synchronize()
+        # A capture that fails leaves its stream the current one, so this thread is set to it here and not only there.
+        with (torch.inference_mode(), torch.cuda.device(self.device), torch.cuda.stream(self.stream),
+              exact_convolutions()):
+            for _ in range(WARM_UP):
+                answer = self._compute(source)
+            targets = tuple(torch.empty(tensor.shape, pin_memory=True) for tensor in answer)
             graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(graph, stream=self.stream):
+            # Other threads may use the GPU meanwhile: by default, the memory that they allocate would end the capture.
+            with torch.cuda.graph(graph, stream=self.stream, capture_error_mode='thread_local'):
                 for target, tensor in zip(targets, self._compute(source), strict=True):
                     target.copy_(tensor, non_blocking=True)
         return _Captured(graph, source, targets)

@@ -114,6 +114,7 @@ def test_another_hand_is_no_jitter(tmp_path, settings, result):
     two.save(tmp_path / 'two.npz')
     for scored in (two, Result.load(tmp_path / 'two.npz'), replace(two, truth=None)):
         told, mixed = scored.summary(), replace(scored, hand_ids=None).summary()
+        assert told['tracks'] == 2
         assert all(told[name] < mixed[name] / 2 for name in ('error_jitter_mm', 'jitter_mm') if name in told)
 
 

@@ -301,7 +301,7 @@ def print_summaries(summaries: Iterable[tuple[str, dict[str, Any]]]) -> None:
         if 'latency_ms' not in summary:
             continue
         line = (f'{name}: {summary["frames_total"]} frames, {number(summary["detection_rate"], 1, " %", 100)} with a '
-                f'hand, {_pace(summary)}')
+                f'hand, {_tracks(summary)}{_pace(summary)}')
         if 'mean_mm' not in summary:  # with truth, the table says more
             line += (f', jitter {number(summary["jitter_mm"], 2, " mm")}, '
                      f'bone drift {number(summary["bone_drift_mm"], 2, " mm")}')
@@ -309,6 +309,12 @@ def print_summaries(summaries: Iterable[tuple[str, dict[str, Any]]]) -> None:
         keys = ('mean', 'p50', 'p90', 'p99', 'max')
         print(text_table(('ms', *keys), [(stage, *(number(row.get(key), 3) for key in keys))
                                          for stage, row in summary['latency_ms'].items()]))
+
+
+def _tracks(summary: dict[str, Any]) -> str:
+    if 'tracks' not in summary:  # a file that an earlier version wrote
+        return ''
+    return f'{summary["tracks"]} track{"s" * (summary["tracks"] != 1)}, '
 
 
 def _pace(summary: dict[str, Any]) -> str:

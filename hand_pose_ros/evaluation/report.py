@@ -40,6 +40,7 @@ _DEFINITIONS = (
     ('AUC', 'Area under this curve from 0 to 80 mm, divided by 80.'),
     ('translation, rigid', 'Mean error after each frame was moved, or moved and turned, onto the truth: what is '
      'left is the error of the pose.'),
+    ('tracks', 'How many hands were tracked. A hand that is lost and found again is a new one.'),
     ('jitter', 'RMS second difference of the error between frames over √6: the size of noise that is independent '
      'from frame to frame. Without truth: of the joints themselves, so that real acceleration counts too. Frames of '
      'different hands are not compared.'),
@@ -184,6 +185,7 @@ def _tiles(summary: dict[str, Any]) -> str:
         ('frames within 40 mm', number(within.get('40'), 1, ' %', 100)),
         ('area under the curve', number(summary.get('auc_0_80'), 3)),
         ('hands found', number(summary['detection_rate'], 1, ' %', 100)),
+        ('tracks', number(summary.get('tracks'), 0)),
         ('frames per second', number(summary.get('frames_per_s'), 0)),
         ('latency, 99th percentile', number(latency.get('p99'), 1, ' ms')),
         ('jitter', number(summary.get('error_jitter_mm', summary.get('jitter_mm')), 1, ' mm')),

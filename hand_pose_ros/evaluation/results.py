@@ -79,6 +79,8 @@ class Result:
         if self.parts and self.truth is not None:
             summary['parts'] = {
                 name: self._accuracy(slice(start, stop)) for name, (start, stop) in self.parts.items()}
+        if self.hand_ids is not None:
+            summary['tracks'] = len({*self.hand_ids} - {''})
         if self.seconds:
             summary['latency_ms'] = {
                 stage: metrics.percentiles(1000 * seconds) for stage, seconds in self.seconds.items()}

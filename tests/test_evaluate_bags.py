@@ -167,7 +167,7 @@ def test_truth_that_does_not_fit_is_refused(tmp_path, bag, model, result, capsys
             (tmp_path / 'few.npz', '3 labels for 12 images'), (tmp_path / 'nyu.npz', r'shape (12, 14, 3)'),
             (tmp_path / 'late.npz', 'no label is within 10 ms'), (tmp_path / 'odd.npz', 'array joints'),
             (tmp_path / 'stamps.npz', 'stamps_ns of shape (11,) for 12 labels'),
-            (tmp_path / 'none.npz', 'there is no label in it'), (tmp_path / 'one.npz', 'the truth has the shape ()'),
+            (tmp_path / 'none.npz', 'joints has no labels'), (tmp_path / 'one.npz', 'the truth has the shape ()'),
             (tmp_path / 'array.npz', 'array joints'),
             ('/truth/joints', 'HandJointsArray named /truth/joints'), ('truth.csv', 'no such file')):
         assert main(arguments(bag, model, '--ground-truth', source)) == 1

@@ -167,6 +167,9 @@ def test_wrong_counts_joints_and_units_are_refused(tmp_path, uvd, capsys):
     arguments = ['evaluate', '--predictions', str(tmp_path / 'none.txt'), '--ground-truth', str(truth)]
     assert main([*arguments, '--dataset', 'nyu']) == 1
     assert 'none.txt' in capsys.readouterr().err
+    arguments[2] = str(truth)
+    assert main([*arguments, '--dataset', 'nyu', '--depth-folder', str(tmp_path)]) == 1
+    assert 'all 8252 test frames of NYU' in (said := capsys.readouterr().err) and 'have 5 in common' in said
     for wrong in ([], arguments, [*arguments, '--dataset', 'mano'], ['bag', *arguments]):
         with pytest.raises(SystemExit) as caught:
             main(['evaluate', *wrong[1:]])

@@ -127,8 +127,8 @@ def _run_text(args: argparse.Namespace) -> int:
     else:
         result = published.load_published(args.predictions, args.ground_truth, dataset)
     if args.depth_folder and len(result.predictions) != published.DATASETS['nyu'].frames:
-        raise InputError(f'--depth-folder needs all 8252 test frames of NYU, but {args.predictions} has '
-                         f'{len(result.predictions)}: leave out --depth-folder')
+        raise InputError(f'--depth-folder needs all 8252 test frames of NYU, but {args.predictions} and '
+                         f'{args.ground_truth} have {len(result.predictions)} in common: leave out --depth-folder')
     others = [published.load_result(source, args.ground_truth, dataset) for source in args.compare]
     read_depths = partial(tompson.read_nyu_depths, args.depth_folder) if args.depth_folder else None
     _deliver(result, others, read_depths, args.json, args.out, args.report, args.compare)

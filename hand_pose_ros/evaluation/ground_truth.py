@@ -58,7 +58,7 @@ def read_truth(source: str, bag: str | Path, skeleton: Skeleton) -> Truth:
             raise InputError(f'{source}: the truth has the shape {shape}, but the joints of the estimator '
                              f'({skeleton.name}) need (frames, {expected[0]}, 3)')
         if not len(truth.joints):
-            raise InputError(f'{source}: there is no label in it')
+            raise InputError(f'{source}: joints has no labels, so there is nothing to compare with')
         if truth.stamps_ns is not None and truth.stamps_ns.shape != shape[:1]:
             raise InputError(f'{source}: stamps_ns of shape {truth.stamps_ns.shape} for {shape[0]} labels: give one '
                              'for each')

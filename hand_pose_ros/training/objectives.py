@@ -135,7 +135,7 @@ class FinderObjective(PoseObjective):
 
     The target of the score of a cell is 1 at a middle, and falls with the distance. The loss is the quality focal loss
     (Li et al. 2020), for which easy cells hardly count. Cells near a middle are also trained to predict where it is.
-    Every other image is mirrored, and some readings are lost.
+    Half of the images are mirrored, and some readings are lost.
     """
 
     SPREAD = 0.035

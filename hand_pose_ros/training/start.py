@@ -141,7 +141,7 @@ def _first_look(recipe: Recipe, base: Checkpoint | None, skeleton: Skeleton) -> 
 
 
 def _start_from(network: nn.Module, base: Checkpoint, recipe: Recipe) -> bool:
-    """Copy the weights of the base into the network. Returns False if only the network has a pose prior.
+    """Copy the weights of the base into the network. Returns False if a pose prior must still be fitted.
 
     The base may lack the prior, and all parts that start as the identity (further blocks of a stage, and the
     refinement). The second of two looks may start from any hand_dense, but not from its prior.

@@ -141,7 +141,7 @@ def save(figure: Figure, path: str | Path) -> None:
 
 
 def _figure(width: float, height: float, columns: int = 1) -> tuple[Figure, NDArray[np.object_]]:
-    """A figure and its row of axes. Without pyplot, which needs a display and keeps every figure."""
+    """A figure and its row of axes. Without pyplot, which may open a display and keeps every figure."""
     figure = Figure((width, height), layout='constrained')
     return figure, figure.subplots(1, columns, squeeze=False)[0]
 
@@ -151,8 +151,10 @@ def _colored(results: Sequence[Result]) -> list[tuple[Result, str]]:
 
 
 def _entry(result: Result) -> str:
-    """The name of a result in a legend. It begins with a blank, because legends leave out names that begin with _. A
-    long name loses its middle."""
+    """The name of a result in a legend. A long one loses its middle.
+
+    It begins with a blank, because legends leave out names that begin with _.
+    """
     name, half = result.name, LONGEST // 2
     return f' {name}' if len(name) <= LONGEST else f' {name[:half]} … {name[-half:]}'
 

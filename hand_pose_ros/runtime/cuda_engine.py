@@ -94,7 +94,7 @@ class CudaEngine(Engine):
 
     def _capture(self, size: int) -> _Captured:
         source = torch.ones(size, 1, PATCH_SIZE, PATCH_SIZE, dtype=self.pipeline.precision, pin_memory=True)
-        # A capture that fails leaves its stream the current one, so this thread is set to it here and not only there.
+        # If a capture fails, torch.cuda.graph leaves its stream the current one. The end of this block puts it back.
         with (torch.inference_mode(), torch.cuda.device(self.device), torch.cuda.stream(self.stream),
               exact_convolutions()):
             for _ in range(WARM_UP):

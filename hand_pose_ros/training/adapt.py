@@ -219,7 +219,8 @@ def fine_tune(network: nn.Module, recorded: Batch, synthetic: Batch, steps: int,
     are its own, so they do not show how far to trust it.
     """
     original = list(network.parameters())
-    network = copy.deepcopy(network).requires_grad_(True).eval()  # norms keep their statistics
+    # In eval mode, norms keep their statistics, because there are two kinds of samples.
+    network = copy.deepcopy(network).requires_grad_(True).eval()
     recipe = replace(RECIPES['modern'], optimizer='adamw', learning_rate=RATE, warmup=0.1)
     objective = objective_for(network, recipe, HAND21)
     objective = objective.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -276,9 +277,8 @@ def judge(found: Look, engine: Engine, progress: Progress) -> Numbers:
 def is_better(before: Numbers, after: Numbers) -> bool:
     """Whether the numbers of `judge` are better for the adapted weights.
 
-    If the truth is known, the error decides. Otherwise the answers must agree better, and must not
-    explain the depth worse. Agreement alone is not enough, because a network that always gives the same answer agrees
-    best.
+    If the truth is known, the error decides. Otherwise the answers must agree better, and must not explain the depth
+    worse. Agreement alone is not enough, because a network that always gives the same answer agrees best.
     """
     def smaller(name: str) -> bool:
         now, was = after[name], before[name]

@@ -86,7 +86,7 @@ def refuse(args: argparse.Namespace, names: Iterable[str], why: str) -> None:
 
 
 def add_bag(parser: Any) -> None:
-    """Add how depth is read from a bag."""
+    """Add the options for reading depth from a bag."""
     parser.add_argument('--depth-topic', metavar='TOPIC',
                         help='topic of the depth images; needed if several topics carry depth')
     parser.add_argument('--camera-info-topic', metavar='TOPIC',
@@ -119,7 +119,7 @@ ESTIMATOR = ('model', 'device', 'side', 'detector', 'cube_size', 'min_score')
 
 
 def add_estimator(parser: Any) -> None:
-    """Add how hands are estimated."""
+    """Add the options for estimating hands."""
     parser.add_argument('--model', help='name of weights that ship, or path of a checkpoint (hand_dense)')
     parser.add_argument('--device', default='auto', help='auto, cpu, cuda or cuda:N (auto)')
     parser.add_argument('--side', default='auto', choices=('auto', 'left', 'right'), help='which hand it is (auto)')

@@ -1,4 +1,4 @@
-"""What happened to the images of the last second, as one status for /diagnostics (REP-107)."""
+"""Which problems are logged, and what happened to the images of the last second, for /diagnostics (REP-107)."""
 
 from __future__ import annotations
 

@@ -16,6 +16,10 @@ class CheckpointError(HandPoseError):
     """Weights that are missing, damaged, or of another kind than expected."""
 
 
+class TrainingError(HandPoseError):
+    """Training cannot start or go on."""
+
+
 @contextmanager
 def naming(source: object) -> Iterator[None]:
     """Begin the message of an InputError with the topic or file that it is about, unless `source` is empty."""

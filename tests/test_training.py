@@ -24,7 +24,7 @@ from hand_pose_ros.cli import main
 from hand_pose_ros.cli.experiment import NAMES
 from hand_pose_ros.datasets import Batch, Dataset, icvl, joints_in_metres, open_dataset
 from hand_pose_ros.datasets.shards import MemoryShards
-from hand_pose_ros.errors import CheckpointError, HandPoseError
+from hand_pose_ros.errors import CheckpointError, HandPoseError, TrainingError
 from hand_pose_ros.geometry import Cube, Intrinsics, crop
 from hand_pose_ros.models import build
 from hand_pose_ros.models.checkpoints import load_checkpoint, save_checkpoint
@@ -33,7 +33,7 @@ from hand_pose_ros.models.two_looks import ZOOM
 from hand_pose_ros.skeleton import HAND21, SKELETONS, Skeleton, get_skeleton
 from hand_pose_ros.training import experiments
 from hand_pose_ros.training.augmentation import PRESETS, Augmentation, augment
-from hand_pose_ros.training.folder import RunFolder, TrainingError
+from hand_pose_ros.training.folder import RunFolder
 from hand_pose_ros.training.gradients import Gradients
 from hand_pose_ros.training.loop import Machine, Run
 from hand_pose_ros.training.losses import joint_loss

@@ -10,15 +10,11 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from hand_pose_ros.errors import HandPoseError
+from hand_pose_ros.errors import TrainingError
 from hand_pose_ros.files import check_writable, write_bytes, write_json
 from hand_pose_ros.training.recipes import Recipe, recipe_from_dict, recipe_to_dict
 
 log = logging.getLogger(__name__)
-
-
-class TrainingError(HandPoseError):
-    """Training cannot start or go on."""
 
 
 class RunFolder:

@@ -23,10 +23,11 @@ from tqdm import tqdm
 from hand_pose_ros.datasets import Batch, open_dataset
 from hand_pose_ros.datasets.memory import keep_freed_memory
 from hand_pose_ros.datasets.shards import DiskShards, MemoryShards
+from hand_pose_ros.errors import TrainingError
 from hand_pose_ros.models.checkpoints import load_checkpoint, save_checkpoint
 from hand_pose_ros.runtime import check_device
 from hand_pose_ros.training.augmentation import augment
-from hand_pose_ros.training.folder import RunFolder, TrainingError
+from hand_pose_ros.training.folder import RunFolder
 from hand_pose_ros.training.gradients import Gradients
 from hand_pose_ros.training.losses import Terms
 from hand_pose_ros.training.objectives import RefinerObjective

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from hand_pose_ros.datasets.base import Dataset
 from hand_pose_ros.datasets.shards import DiskShards, MemoryShards
+from hand_pose_ros.errors import TrainingError
 from hand_pose_ros.models import REFINERS, build
 from hand_pose_ros.models.checkpoints import Checkpoint, load_checkpoint
 from hand_pose_ros.models.dense import ADDED, HandDense
@@ -18,7 +19,6 @@ from hand_pose_ros.models.two_looks import TwoLooks
 from hand_pose_ros.runtime import NO_JOINTS
 from hand_pose_ros.skeleton import Skeleton
 from hand_pose_ros.training.augmentation import PRESETS, augment
-from hand_pose_ros.training.folder import TrainingError
 from hand_pose_ros.training.objectives import PoseObjective, RefinerObjective, joints_count, objective_for
 from hand_pose_ros.training.recipes import Recipe
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from hand_pose_ros.estimator import SIZE_IMAGES, USUAL_SIZE, HandPoseEstimator
 from hand_pose_ros.geometry import Cube, crop
-from hand_pose_ros.models.dense import TOLD_SIZE
+from hand_pose_ros.models.dense import HAND_PER_CUBE
 from hand_pose_ros.skeleton import HAND21
 from hand_pose_ros.synthetic.generator import SyntheticHands
 
@@ -57,7 +57,7 @@ def main() -> None:
                 continue
             tracked = float(np.exp(sum(told) / (len(told) + SIZE_IMAGES)))
             errors, answer = read([0.30, 0.285, 0.30 * length / USUAL_SIZE, 0.30 * tracked])
-            usual = np.log(0.30 * TOLD_SIZE / USUAL_SIZE)
+            usual = np.log(0.30 * HAND_PER_CUBE / USUAL_SIZE)
             told.append(float(answer['size'][3]) + usual + np.log(tracked))
             own, _ = read([0.30 * np.exp(answer['size'][0] + usual)])
             rows.append([length, *errors[:3], *own, errors[3]])

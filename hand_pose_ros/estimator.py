@@ -23,7 +23,7 @@ from hand_pose_ros.errors import InputError
 from hand_pose_ros.geometry import PATCH_SIZE, Cube, Intrinsics, crop
 from hand_pose_ros.hand import HandEstimate, Side
 from hand_pose_ros.models.checkpoints import load_checkpoint
-from hand_pose_ros.models.dense import TOLD_SIZE
+from hand_pose_ros.models.dense import HAND_PER_CUBE
 from hand_pose_ros.runtime import Engine, default_threads, make_engine
 from hand_pose_ros.runtime.finder import Finder
 from hand_pose_ros.scoring import explain, learned
@@ -304,7 +304,7 @@ class HandPoseEstimator:
                 coordinates[:, 0] *= -1
             size = 0.0
             if 'size' in answer and self.skeleton.has_wrist:  # without a wrist, the network has not learned the size
-                size = float(answer['size'][shown]) + math.log(TOLD_SIZE * cube.side / USUAL_SIZE)
+                size = float(answer['size'][shown]) + math.log(HAND_PER_CUBE * cube.side / USUAL_SIZE)
             return _Reading(cube, cube.from_cube(coordinates), confidence[shown], float(score[shown]), rightness, size)
 
     def _mirrorings(self, track: _Track) -> tuple[bool, ...]:

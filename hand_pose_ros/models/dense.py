@@ -24,9 +24,9 @@ CELLS = 32
 """Cells along each side of the maps. One cell covers 4 x 4 pixels of the patch."""
 REACH = 0.8
 """Cells that are further from a joint than this, in cube units, do not vote for it."""
-TOLD_SIZE = 0.19 / 0.30
-"""Length of the hand for which the output `size` is 0, over the side of its cube. The length is measured from the wrist
-along the bones to the tip of the middle finger."""
+HAND_PER_CUBE = 0.19 / 0.30
+"""Length of a hand over the side of its cube, where the output `size` is 0. The length is measured from the wrist along
+the bones to the tip of the middle finger."""
 SHARPNESS = 30.0
 """Weight of a vote: exp(SHARPNESS * closeness)."""
 ADDED = re.compile(r'\bstages\.\d+\.[1-9]\d*\.|\brefinement\.')
@@ -135,7 +135,7 @@ class HandDense(nn.Module):
         - joints (B, J, 3) in cube units
         - logits: confidence (B, J) that a joint is right, hand (B,) that this is a hand, side (B,) that it is a right
           hand
-        - size (B,): log(length of the hand / (TOLD_SIZE * side of the cube))
+        - size (B,): log(length of the hand / (HAND_PER_CUBE * side of the cube))
         - for the loss: votes (B, J, 3), the joints before the prior; unrefined (B, J, 3), the joints before the
           refinement; positions (B, 3, 32, 32), seen (B, 1, 32, 32), directions (B, J, 3, 32, 32), closeness
           (B, J, 32, 32)

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from hand_pose_ros.datasets import Batch, joints_in_metres
-from hand_pose_ros.models.dense import TOLD_SIZE, encode
+from hand_pose_ros.models.dense import HAND_PER_CUBE, encode
 from hand_pose_ros.models.finder import CELL, FOCAL, cell_rays
 from hand_pose_ros.models.two_looks import TwoLooks
 from hand_pose_ros.skeleton import Skeleton
@@ -113,7 +113,7 @@ class DenseObjective(PoseObjective):
             return torch.zeros_like(batch['cube_side'])
         cube = batch['cube_center'], batch['cube_side']
         bones = chosen(joints_in_metres(batch['joints'], *cube), self.middle_finger).diff(dim=1).norm(dim=-1)
-        return torch.log((bones.sum(1) / batch['cube_side']).clamp(min=0.01) / TOLD_SIZE)
+        return torch.log((bones.sum(1) / batch['cube_side']).clamp(min=0.01) / HAND_PER_CUBE)
 
 
 class SecondLookObjective(DenseObjective):

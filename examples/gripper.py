@@ -20,11 +20,11 @@ from std_msgs.msg import Float64MultiArray
 
 from hand_pose_ros.angles import ANGLES, finger_angles
 from hand_pose_ros.errors import HandPoseError, InputError
-from hand_pose_ros.msg import HandJoints, HandJointsArray
+from hand_pose_ros.hand import side_of
+from hand_pose_ros.msg import HandJointsArray
 from hand_pose_ros.ros import init
 from hand_pose_ros.skeleton import HAND21
 
-SIDES = {HandJoints.LEFT: 'left', HandJoints.RIGHT: 'right'}
 PIP = [ANGLES.index(f'{finger}_pip_flexion') for finger in ('index', 'middle', 'ring', 'pinky')]
 FIST_RAD = 1.4
 """In a fist, the middle joint of a finger is bent by at least this angle."""
@@ -57,11 +57,11 @@ class Gripper(Node):
             return
         # Two hands have nearly the same score. With the score alone, the gripper would switch between them.
         hand = max(message.hands, key=lambda hand: (hand.id == self.followed, hand.score), default=None)
-        if hand is None or hand.score < MIN_SCORE or hand.side not in SIDES:
+        if hand is None or hand.score < MIN_SCORE or side_of(hand.side) == 'unknown':
             return
         self.followed = hand.id
         joints = np.array([(point.x, point.y, point.z) for point in hand.joints])
-        wanted = self.max_opening * (1 - closing(joints, SIDES[hand.side]))
+        wanted = self.max_opening * (1 - closing(joints, side_of(hand.side)))
         now = self.get_clock().now()
         # Clocks jump: back when a bag starts again, and far ahead after a pause.
         reach = SPEED * np.clip((now - self.moved).nanoseconds / 1e9, 0, 0.1)

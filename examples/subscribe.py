@@ -16,11 +16,10 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 
 from hand_pose_ros.errors import HandPoseError
-from hand_pose_ros.msg import HandJoints, HandJointsArray
+from hand_pose_ros.hand import side_of
+from hand_pose_ros.msg import HandJointsArray
 from hand_pose_ros.ros import init
 from hand_pose_ros.skeleton import get_skeleton
-
-SIDES = {HandJoints.LEFT: 'left', HandJoints.RIGHT: 'right', HandJoints.UNKNOWN: 'unknown'}
 
 
 class Listener(Node):
@@ -38,7 +37,7 @@ class Listener(Node):
             index_tip = get_skeleton(message.skeleton).joint_names.index('index_tip')  # models have different joints
             # Metres, in the frame message.header.frame_id: x right, y down, z forward, unless target_frame is set.
             tip = hand.joints[index_tip]
-            print(f'{hand.id} {SIDES[hand.side]:<7} index tip at {tip.x:+.3f} {tip.y:+.3f} {tip.z:.3f} m, '
+            print(f'{hand.id} {side_of(hand.side):<7} index tip at {tip.x:+.3f} {tip.y:+.3f} {tip.z:.3f} m, '
                   f'confidence {hand.confidence[index_tip]:.2f}', flush=True)
 
 

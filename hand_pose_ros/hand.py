@@ -11,6 +11,13 @@ from numpy.typing import NDArray
 from hand_pose_ros.geometry import Cube
 
 Side = Literal['left', 'right', 'unknown']
+SIDES: tuple[Side, ...] = ('unknown', 'left', 'right')
+"""In the order of their numbers in messages: `HandJoints.side`."""
+
+
+def side_of(number: int) -> Side:
+    """The side that a message gives as a number."""
+    return SIDES[number] if number < len(SIDES) else 'unknown'
 
 
 @dataclass(frozen=True, eq=False)  # comparing arrays does not give one True or False

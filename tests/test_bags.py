@@ -17,9 +17,10 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
 from hand_pose_ros.bags import Bag, BagWriter, DepthBag, read_hands
-from hand_pose_ros.bags.bag import SIDES, typestore
+from hand_pose_ros.bags.bag import typestore
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.geometry import Cube, Intrinsics
+from hand_pose_ros.hand import SIDES
 from hand_pose_ros.markers import HandMarkers, Marker
 from hand_pose_ros.skeleton import HAND21, Skeleton
 

@@ -22,8 +22,6 @@ from hand_pose_ros.resources import resource
 IMAGE, COMPRESSED_IMAGE = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
 HAND, HANDS, SKELETON = (f'hand_pose_ros/msg/{name}' for name in ('HandJoints', 'HandJointsArray', 'HandSkeleton'))
-SIDES = ('unknown', 'left', 'right')
-"""The names of the values of HandJoints.side, in their order."""
 
 _Self = TypeVar('_Self', bound='Bag')
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.interfaces import Connection
 
-from hand_pose_ros.bags.bag import CAMERA_INFO, COMPRESSED_IMAGE, HANDS, IMAGE, SIDES, Bag
+from hand_pose_ros.bags.bag import CAMERA_INFO, COMPRESSED_IMAGE, HANDS, IMAGE, Bag
 from hand_pose_ros.conventions import (
     CROP,
     TRANSPORTS,
@@ -27,6 +27,7 @@ from hand_pose_ros.conventions import (
 from hand_pose_ros.depth import DEPTH_ENCODINGS, decode_compressed, decode_image
 from hand_pose_ros.errors import InputError, naming
 from hand_pose_ros.geometry import Intrinsics
+from hand_pose_ros.hand import side_of
 from hand_pose_ros.skeleton import SKELETONS
 
 
@@ -255,7 +256,7 @@ def _recorded_hands(message: Any, source: str) -> RecordedHands:
         np.array(joints, np.float64).reshape(*shape, 3),
         np.array([hand.confidence for hand in message.hands], np.float32).reshape(shape),
         np.array([hand.score for hand in message.hands], np.float32),
-        tuple(SIDES[hand.side] if hand.side < len(SIDES) else 'unknown' for hand in message.hands),
+        tuple(side_of(hand.side) for hand in message.hands),
         tuple(hand.id for hand in message.hands))
 
 

@@ -21,7 +21,6 @@ from hand_pose_ros.bags.bag import (
     HAND,
     HANDS,
     IMAGE,
-    SIDES,
     SKELETON,
     PathForSqlite,
     typestore,
@@ -31,7 +30,7 @@ from hand_pose_ros.depth import encode_compressed, to_units
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.files import naming_full_disk
 from hand_pose_ros.geometry import Intrinsics
-from hand_pose_ros.hand import HandEstimate
+from hand_pose_ros.hand import SIDES, HandEstimate
 from hand_pose_ros.markers import Marker
 from hand_pose_ros.skeleton import HAND21, Skeleton
 

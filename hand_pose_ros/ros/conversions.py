@@ -18,15 +18,12 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from hand_pose_ros.angles import ANGLES, finger_angles
 from hand_pose_ros.errors import InputError
-from hand_pose_ros.estimator import HandEstimate, Side
 from hand_pose_ros.geometry import Cube
+from hand_pose_ros.hand import SIDES, HandEstimate, side_of
 from hand_pose_ros.markers import Color
 from hand_pose_ros.markers import Marker as HandMarker
 from hand_pose_ros.msg import HandJoints, HandJointsArray, HandSkeleton
 from hand_pose_ros.skeleton import Skeleton
-
-SIDES: dict[Side, int] = {'unknown': HandJoints.UNKNOWN, 'left': HandJoints.LEFT, 'right': HandJoints.RIGHT}
-_SIDE_NAMES = {number: side for side, number in SIDES.items()}
 
 
 def hands_to_msg(header: Header, hands: Sequence[HandEstimate], skeleton: Skeleton) -> HandJointsArray:
@@ -37,7 +34,7 @@ def hands_to_msg(header: Header, hands: Sequence[HandEstimate], skeleton: Skelet
 def hand_to_msg(hand: HandEstimate) -> HandJoints:
     """One hand, in metres in the optical frame of the camera."""
     return HandJoints(
-        id=hand.id, side=SIDES[hand.side], score=float(hand.score),
+        id=hand.id, side=SIDES.index(hand.side), score=float(hand.score),
         joints=_points(hand.joints), confidence=array('f', hand.confidence.tolist()),
         cube_center=_points([hand.cube.center])[0], cube_size=float(hand.cube.side))
 
@@ -56,7 +53,7 @@ def hand_from_msg(message: HandJoints, skeleton: Skeleton) -> HandEstimate:
     return HandEstimate(
         joints=np.array([(point.x, point.y, point.z) for point in message.joints], np.float32),
         joint_names=skeleton.joint_names, confidence=np.array(message.confidence, np.float32), score=message.score,
-        side=_SIDE_NAMES.get(message.side, 'unknown'), cube=Cube((center.x, center.y, center.z), message.cube_size),
+        side=side_of(message.side), cube=Cube((center.x, center.y, center.z), message.cube_size),
         id=message.id)
 
 

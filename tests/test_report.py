@@ -14,9 +14,9 @@ from matplotlib.legend import Legend
 
 from hand_pose_ros.cli import main
 from hand_pose_ros.evaluation import metrics, plots
-from hand_pose_ros.evaluation.published import DATASETS, named_apart
+from hand_pose_ros.evaluation.published import DATASETS
 from hand_pose_ros.evaluation.report import write_report
-from hand_pose_ros.evaluation.results import Result
+from hand_pose_ros.evaluation.results import Result, named_apart
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.skeleton import HAND21, get_skeleton
 from hand_pose_ros.training.figures import runtime

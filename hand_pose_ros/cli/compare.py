@@ -12,8 +12,8 @@ from hand_pose_ros.cli.arguments import check_outputs, count
 from hand_pose_ros.cli.evaluate import print_summaries
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.evaluation import metrics
-from hand_pose_ros.evaluation.published import DATASETS, load_result, named_apart, split_source
-from hand_pose_ros.evaluation.results import Result, told_notes
+from hand_pose_ros.evaluation.published import DATASETS, load_result
+from hand_pose_ros.evaluation.results import Result, named_apart, split_source, told_notes
 from hand_pose_ros.files import write_json
 
 DESCRIPTION = 'Compare any number of results: tables, curves, and confidence intervals of their differences.'

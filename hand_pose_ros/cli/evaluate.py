@@ -28,7 +28,7 @@ from hand_pose_ros.cli.arguments import (
 )
 from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.evaluation import published
-from hand_pose_ros.evaluation.results import Result, told_notes
+from hand_pose_ros.evaluation.results import Result, named_apart, split_source, told_notes
 from hand_pose_ros.evaluation.tables import ACCURACY_COLUMNS, accuracy_rows, number, text_table
 from hand_pose_ros.files import write_json
 
@@ -94,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
     if args.out and len(args.bags) < 2 and Path(args.out).suffix != '.npz':
         args.parser.error(f'--out {args.out}: the result is an .npz file')
     out = Path(args.out) / 'any.npz' if args.out and len(args.bags) > 1 else args.out
-    compared = [published.split_source(source)[1] for source in args.compare]
+    compared = [split_source(source)[1] for source in args.compare]
     check_outputs((args.json, out, args.report and Path(args.report) / 'report.html'),
                   (*args.bags, args.ground_truth, args.predictions, *compared))
     if args.predictions:
@@ -275,7 +275,7 @@ def _deliver(result: Result, others: Sequence[Result], read_depths: Callable[[Se
              json: str | None = None, out: str | Path | None = None, report: str | Path | None = None,
              sources: Sequence[str] = ()) -> None:
     """Write the outputs and print the numbers. `sources` are the files of the other results."""
-    result, *others = published.named_apart([result, *others], ['', *sources])
+    result, *others = named_apart([result, *others], ['', *sources])
     for note in told_notes([result, *others]):
         print(f'NOTE: {note}', file=sys.stderr)
     summary = result.summary()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import gzip
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hand_pose_ros.errors import InputError
-from hand_pose_ros.evaluation.results import Result
+from hand_pose_ros.evaluation.results import Result, split_source
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.skeleton import Skeleton, get_skeleton
 
@@ -152,32 +152,6 @@ def load_published(predictions: str | Path, truth: str | Path, dataset: Dataset)
         parts=dict(dataset.parts) if whole else {}, notes=notes,
         info={'predictions': str(predictions), 'ground_truth': str(truth), 'dataset': dataset.name,
               'intrinsics': f'fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g}'})
-
-
-def split_source(source: str) -> tuple[str, str]:
-    """Name and path of `FILE` or `NAME=FILE`. Without NAME, the name is empty. The name of FILE may contain a `=`."""
-    name, equals, path = source.partition('=')
-    return (name, path) if equals and not Path(source).exists() else ('', source)
-
-
-def named_apart(results: Sequence[Result], sources: Sequence[str]) -> list[Result]:
-    """The results with different names.
-
-    If several results have the same name, those to which the user gave no name are named by their file, with as many
-    folders as needed. If names are still the same, they are numbered.
-
-    Args:
-        sources: of each result, as in `load_result`. It is empty for a result that is not from a file.
-    """
-    names = [result.name for result in results]
-    given, paths = zip(*map(split_source, sources), strict=True)
-    for parts in range(1, max(len(Path(path).parts) for path in paths) + 1):
-        names = [str(Path(*Path(path).with_suffix('').parts[-parts:]))
-                 if names.count(name) > 1 and path and not own else name
-                 for name, own, path in zip(names, given, paths, strict=True)]
-    numbers = [names[:i].count(name) + 1 for i, name in enumerate(names)]
-    return [replace(result, name=name if number == 1 else f'{name} ({number})')
-            for result, name, number in zip(results, names, numbers, strict=True)]
 
 
 def load_result(source: str, truth: str | Path | None = None, dataset: Dataset | None = None) -> Result:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -150,3 +150,29 @@ class Result:
 def told_notes(results: Sequence[Result]) -> list[str]:
     """The notes of all results. If there are several results, each note begins with the name of its result."""
     return [f'{result.name}: {note}' if len(results) > 1 else note for result in results for note in result.notes]
+
+
+def split_source(source: str) -> tuple[str, str]:
+    """Name and path of `FILE` or `NAME=FILE`. Without NAME, the name is empty. The name of FILE may contain a `=`."""
+    name, equals, path = source.partition('=')
+    return (name, path) if equals and not Path(source).exists() else ('', source)
+
+
+def named_apart(results: Sequence[Result], sources: Sequence[str]) -> list[Result]:
+    """The results with different names.
+
+    If several results have the same name, those to which the user gave no name are named by their file, with as many
+    folders as needed. If names are still the same, they are numbered.
+
+    Args:
+        sources: of each result, `FILE` or `NAME=FILE`. It is empty for a result that is not from a file.
+    """
+    names = [result.name for result in results]
+    given, paths = zip(*map(split_source, sources), strict=True)
+    for parts in range(1, max(len(Path(path).parts) for path in paths) + 1):
+        names = [str(Path(*Path(path).with_suffix('').parts[-parts:]))
+                 if names.count(name) > 1 and path and not own else name
+                 for name, own, path in zip(names, given, paths, strict=True)]
+    numbers = [names[:i].count(name) + 1 for i, name in enumerate(names)]
+    return [replace(result, name=name if number == 1 else f'{name} ({number})')
+            for result, name, number in zip(results, names, numbers, strict=True)]

@@ -112,8 +112,6 @@ def bag_options(args: argparse.Namespace) -> dict[str, Any]:
             'intrinsics': args.intrinsics and tuple(args.intrinsics), 'depth_scale': args.depth_scale}
 
 
-BAG = ('depth_topic', 'camera_info_topic', 'intrinsics', 'depth_scale')
-"""What `add_bag` adds."""
 ESTIMATOR = ('model', 'device', 'side', 'detector', 'cube_size', 'min_score')
 """What `add_estimator` adds."""
 

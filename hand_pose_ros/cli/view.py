@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from hand_pose_ros.bags import DepthBag
 from hand_pose_ros.cli.arguments import (
-    BAG,
     ESTIMATOR,
     add_bag,
     add_estimator,
@@ -71,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
     if args.bag is not None:
         refuse(args, ('transport', 'ros_args'), 'is for live topics')
         return _view_bag(args)
-    refuse(args, (*(name for name in BAG if name not in ('intrinsics', 'depth_scale')), *ESTIMATOR, 'max_hands'),
+    refuse(args, ('depth_topic', 'camera_info_topic', *ESTIMATOR, 'max_hands'),
            'is for bags: choose live topics with --ros-args -r from:=to')
     check_intrinsics(args)
     from hand_pose_ros.ros.watch import watch  # without ROS, this says what is missing

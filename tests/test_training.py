@@ -922,7 +922,7 @@ def test_the_finder_of_hands_learns_from_whole_scenes(folder, tmp_path):
 def test_a_network_starts_from_another_and_gets_a_prior_if_that_had_none(folder, tmp_path, monkeypatch):
     plain = tmp_path / 'plain.safetensors'
     facts = {'skeleton': 'icvl16', 'cube_side': 0.3}
-    save_checkpoint(plain, build('hand_dense', joints=16, width=8), facts, half=False)
+    save_checkpoint(plain, build('hand_dense', joints=16, width=8), facts)
     wanted = ('network=hand_dense', 'options.width=8')
     run = tiny(folder, *wanted, f'base={plain}', out=tmp_path / 'first')
     first = run.objective.network
@@ -935,14 +935,14 @@ def test_a_network_starts_from_another_and_gets_a_prior_if_that_had_none(folder,
     torch.testing.assert_close(gram, torch.eye(8), atol=1e-5, rtol=0)  # of principal components
     first.head.output.bias.data.fill_(0.1)
     path = tmp_path / 'with.safetensors'
-    save_checkpoint(path, first, facts, half=False)
+    save_checkpoint(path, first, facts)
     second = tiny(folder, *wanted, f'base={path}', out=tmp_path / 'second').objective.network
-    pairs = zip(first.state_dict().values(), second.state_dict().values(), strict=True)
+    pairs = zip(load_checkpoint(path).network.state_dict().values(), second.state_dict().values(), strict=True)
     assert all(torch.equal(one, other) for one, other in pairs)
     with pytest.raises(TrainingError, match='holds another network than the recipe names'):
         tiny(folder, f'base={path}', out=tmp_path / 'third')
     # As many joints, but others: neither they nor their prior would be those of the dataset.
-    save_checkpoint(path, first, {**facts, 'skeleton': 'other16'}, half=False)
+    save_checkpoint(path, first, {**facts, 'skeleton': 'other16'})
     monkeypatch.setitem(SKELETONS, 'other16', replace(get_skeleton('icvl16'), name='other16'))
     with pytest.raises(TrainingError, match='gives joints of other16, but icvl has those of icvl16'):
         tiny(folder, *wanted, f'base={path}', out=tmp_path / 'fourth')
@@ -955,7 +955,7 @@ def test_a_network_with_further_blocks_and_a_refinement_starts_as_the_one_it_gre
     network = build('hand_dense', joints=16, width=8, bottleneck=8)
     for norm in (part for part in network.modules() if isinstance(part, nn.BatchNorm2d)):
         nn.init.uniform_(norm.weight, 0.5, 1)  # as after training: none is zero
-    save_checkpoint(base, network, facts, half=False)
+    save_checkpoint(base, network, facts)
     wanted = ('network=hand_dense', 'options.width=8', f'base={base}')
     run = tiny(folder, *wanted, 'options.blocks=[1,2,1,3]', 'options.refined=true', 'samples=40', recipe='modern',
                out=tmp_path / 'grown')

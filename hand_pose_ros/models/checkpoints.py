@@ -44,12 +44,13 @@ def available() -> dict[str, Path]:
 
 
 def save_checkpoint(path: str | Path, network: nn.Module, metadata: dict[str, Any],
-                    refiner: nn.Module | None = None, half: bool = True) -> None:
+                    refiner: nn.Module | None = None) -> None:
     """Write a network (and its refiner), both made by `build`. The file is written in one step, never half.
+
+    The trained weights are stored as float16. Running statistics stay float32, because their range is open.
 
     Args:
         metadata: must have 'skeleton' and 'cube_side' [m]. All other keys that JSON can hold are kept.
-        half: store the trained weights as float16. Running statistics stay float32, because their range is open.
 
     Raises:
         CheckpointError: the metadata lacks a key, or a weight is not finite (or too large for float16).
@@ -59,10 +60,10 @@ def save_checkpoint(path: str | Path, network: nn.Module, metadata: dict[str, An
         raise CheckpointError(f"the metadata of checkpoint {path} lacks {', '.join(sorted(missing))}")
     metadata = {**metadata, **_description(network), 'version': __version__}
     metadata.pop('refiner', None)  # it belongs to the checkpoint from which these metadata were taken
-    tensors = _tensors('network', network, half)
+    tensors = _tensors('network', network)
     if refiner is not None:
         metadata['refiner'] = _description(refiner)
-        tensors |= _tensors('refiner', refiner, half)
+        tensors |= _tensors('refiner', refiner)
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not tensor.isfinite().all():
             raise CheckpointError(f"checkpoint {path} is not written: '{name}' holds values that are "
@@ -103,9 +104,9 @@ def _description(network: nn.Module) -> dict[str, Any]:
     return {key: vars(network)[key] for key in ('architecture', 'config')}
 
 
-def _tensors(part: str, network: nn.Module, half: bool) -> dict[str, Tensor]:
+def _tensors(part: str, network: nn.Module) -> dict[str, Tensor]:
     weights = {name for name, _ in network.named_parameters()}
-    return {f'{part}.{name}': (tensor.half() if half and name in weights else tensor).contiguous().cpu()
+    return {f'{part}.{name}': (tensor.half() if name in weights else tensor).contiguous().cpu()
             for name, tensor in network.state_dict().items()}
 
 

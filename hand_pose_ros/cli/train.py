@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -91,8 +92,8 @@ def run(args: argparse.Namespace) -> int:
         folder.require_none()  # now, not after the first samples were made
         check_writable(folder.state)
     recipe = folder.recipe() if args.resume else get_recipe(args.recipe, args.overrides)
-    with logging_redirect_tqdm(), process_group(args.device):
-        training = Run(args.out, recipe, machine(args))
+    with logging_redirect_tqdm(), process_group(args.device) as device:
+        training = Run(args.out, recipe, replace(machine(args), device=device))
         training.train(args.resume)
     if training.rank == 0:
         print(f'the best weights in validation: {folder.checkpoint("best")}')

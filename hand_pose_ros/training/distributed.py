@@ -13,21 +13,22 @@ from hand_pose_ros.runtime import check_device
 
 
 @contextmanager
-def process_group(device: str) -> Iterator[None]:
-    """Join the processes that torchrun started, if it did.
+def process_group(device: str) -> Iterator[str]:
+    """Join the processes that torchrun started, if it did. Gives the device of this process: of GPUs, one of its own.
 
     Raises:
         HandPoseError: there is no GPU for this process.
     """
     if 'RANK' not in os.environ:
-        yield
+        yield device
         return
     if device.startswith('cuda'):
-        check_device(own := f'cuda:{os.environ["LOCAL_RANK"]}')
-        torch.cuda.set_device(own)
+        device = f'cuda:{os.environ["LOCAL_RANK"]}'
+        check_device(device)
+        torch.cuda.set_device(device)
     dist.init_process_group('nccl' if device.startswith('cuda') else 'gloo')
     try:
-        yield
+        yield device
         dist.barrier()  # the first process validates alone at the end, and the others must not end the group before
     finally:
         dist.destroy_process_group()

@@ -91,8 +91,6 @@ class Run:
         self._stop = self._waiting = self._ending = False
         check_device(machine.device)  # before minutes of rendering
         self.device = torch.device(machine.device)
-        if self.device.type == 'cuda' and 'LOCAL_RANK' in os.environ:
-            self.device = torch.device('cuda', int(os.environ['LOCAL_RANK']))
         if self.device.type == 'cuda' and self.device.index is not None:
             torch.cuda.set_device(self.device)  # graphs are captured on the current device
 

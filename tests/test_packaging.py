@@ -106,6 +106,12 @@ def test_import_is_light() -> None:
     assert run(sys.executable, '-c', code, cwd=CHECKOUT).split() == []
 
 
+def test_neither_the_viewer_of_live_topics_nor_the_table_of_parameters_waits_for_torch() -> None:
+    pytest.importorskip('rclpy', reason='ROS is not installed')
+    code = "import sys, hand_pose_ros.ros.watch, hand_pose_ros.ros.params; print('torch' in sys.modules)"
+    assert run(sys.executable, '-c', code, cwd=CHECKOUT).split() == ['False']
+
+
 # ----------------------------------------------------------------------------------------------------------- the doors
 
 ROS = re.compile(r'(rclpy|tf2_\w+|launch\w*|ament_index_python|\w+_msgs|\w+_interfaces|std_srvs|hand_pose_ros\.msg)\b')

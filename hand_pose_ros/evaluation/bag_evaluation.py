@@ -23,11 +23,12 @@ from numpy.typing import NDArray
 
 from hand_pose_ros.bags import DepthBag, Frame
 from hand_pose_ros.errors import HandPoseError, InputError
-from hand_pose_ros.estimator import HandEstimate, HandPoseEstimator
+from hand_pose_ros.estimator import HandPoseEstimator
 from hand_pose_ros.evaluation.ground_truth import read_truth, with_truth
 from hand_pose_ros.evaluation.progress import Progress, silent
 from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.geometry import Intrinsics
+from hand_pose_ros.hand import HandEstimate
 from hand_pose_ros.models.checkpoints import DEFAULT
 from hand_pose_ros.processes import leave_with_parent
 from hand_pose_ros.runtime import check_device, cores

@@ -33,8 +33,9 @@ from hand_pose_ros.conventions import stamp_ns
 from hand_pose_ros.depth import decode_compressed, decode_image, depth_problem
 from hand_pose_ros.detection import Region
 from hand_pose_ros.errors import HandPoseError
-from hand_pose_ros.estimator import HandEstimate, HandPoseEstimator
+from hand_pose_ros.estimator import HandPoseEstimator
 from hand_pose_ros.geometry import Intrinsics
+from hand_pose_ros.hand import HandEstimate
 from hand_pose_ros.models.checkpoints import DEFAULT
 from hand_pose_ros.ros import params as parameters
 from hand_pose_ros.ros import qos, topics

@@ -16,8 +16,9 @@ from visualization_msgs.msg import MarkerArray
 
 from hand_pose_ros.conventions import CROP
 from hand_pose_ros.errors import HandPoseError
-from hand_pose_ros.estimator import HandEstimate, HandPoseEstimator
+from hand_pose_ros.estimator import HandPoseEstimator
 from hand_pose_ros.geometry import Intrinsics, crop
+from hand_pose_ros.hand import HandEstimate
 from hand_pose_ros.markers import HandMarkers
 from hand_pose_ros.models.checkpoints import described
 from hand_pose_ros.msg import HandJointsArray, HandSkeleton

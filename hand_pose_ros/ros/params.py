@@ -7,7 +7,7 @@ import re
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.exceptions import ParameterException
@@ -16,7 +16,9 @@ from rclpy.parameter import Parameter
 
 from hand_pose_ros.conventions import TRANSPORTS
 from hand_pose_ros.errors import HandPoseError
-from hand_pose_ros.estimator import HandPoseEstimator
+
+if TYPE_CHECKING:
+    from hand_pose_ros.estimator import HandPoseEstimator
 
 
 def _parameter(default: Any, description: str, *, name: str | None = None, low: float | None = None,
@@ -122,6 +124,7 @@ class Params:
         Raises:
             HandPoseError: the weights or the device do not exist.
         """
+        from hand_pose_ros.estimator import HandPoseEstimator  # imports torch, which neither help nor the viewer needs
         estimator = HandPoseEstimator.from_pretrained(
             self.model or None, device=self.device, num_threads=self.num_threads or None,
             detector='nearest' if self.detector == 'nearest' else 'network')

@@ -18,8 +18,8 @@ from hand_pose_ros.bags import check_frame
 from hand_pose_ros.conventions import stamp_ns
 from hand_pose_ros.depth import decode_compressed, decode_image
 from hand_pose_ros.errors import HandPoseError, InputError
-from hand_pose_ros.estimator import HandEstimate
 from hand_pose_ros.geometry import Intrinsics
+from hand_pose_ros.hand import HandEstimate
 from hand_pose_ros.msg import HandJointsArray
 from hand_pose_ros.ros import qos, topics
 from hand_pose_ros.ros.camera import Camera

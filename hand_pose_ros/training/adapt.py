@@ -25,11 +25,11 @@ from hand_pose_ros.bags import Frame
 from hand_pose_ros.datasets import Batch, joints_in_metres
 from hand_pose_ros.datasets.base import mirrored
 from hand_pose_ros.errors import HandPoseError, InputError
-from hand_pose_ros.estimator import HandEstimate
 from hand_pose_ros.evaluation.bag_evaluation import Settings, evaluate_bag
 from hand_pose_ros.evaluation.progress import Progress
 from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.geometry import crop
+from hand_pose_ros.hand import HandEstimate
 from hand_pose_ros.runtime import Engine
 from hand_pose_ros.scoring import explain
 from hand_pose_ros.skeleton import HAND21

@@ -297,7 +297,7 @@ class HandPoseEstimator:
             answer = self.engine.run_full(patches)
         with self._timed('uncrop'):
             confidence, score, right = self._judge(patches, answer, cube)
-            rightness = float(right[0] - right[-1])
+            rightness = float(right[0] - right[-1])  # 0 if the network saw one side only
             shown = int(len(mirrored) == 2 and SIDE_MEMORY * track.rightness + rightness < 0)
             coordinates = answer['joints'][shown].astype(np.float64)
             if mirrored[shown]:

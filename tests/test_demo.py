@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
@@ -35,6 +36,7 @@ COUNT = 6
 @pytest.fixture
 def weights(tmp_path: Path) -> Path:
     """A network that has learned nothing."""
+    torch.manual_seed(0)
     path = tmp_path / 'weights.safetensors'
     save_checkpoint(path, build('deep_prior', joints=21), {'skeleton': 'hand21', 'cube_side': 0.3})
     return path

@@ -8,6 +8,7 @@ import sys
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from hand_pose_ros.bags import Bag, BagWriter, read_hands
 from hand_pose_ros.cli import main
@@ -27,6 +28,7 @@ STAMPS = [1_700_000_000_000_000_001 + i * 33_000_000 for i in range(6)]
 @pytest.fixture(scope='module')
 def weights(tmp_path_factory):
     """A network that has learned nothing: here it matters where its answers go, not what they are."""
+    torch.manual_seed(0)
     path = tmp_path_factory.mktemp('weights') / 'untrained.safetensors'
     save_checkpoint(path, build('deep_prior', joints=21), {'skeleton': 'hand21', 'cube_side': 0.3})
     return path

@@ -17,6 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import torch
 from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
@@ -216,6 +217,7 @@ def test_camera_infos(message: CameraInfo, rectified: bool) -> None:
 @pytest.fixture(scope='module', params=['raw', 'compressedDepth'])
 def node(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[EstimatorNode]:
     """A node that is called directly, as DDS would not let half of the messages through, and answers into `said`."""
+    torch.manual_seed(0)
     weights = tmp_path_factory.mktemp('weights') / 'untrained.safetensors'
     save_checkpoint(weights, build('deep_prior', joints=21), {'skeleton': 'hand21', 'cube_side': 0.3})
     context = rclpy.Context()

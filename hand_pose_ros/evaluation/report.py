@@ -73,7 +73,8 @@ def write_report(results: Sequence[Result], folder: str | Path, read_depths: Rea
         _section('Notes', ''.join(f'<p>{escape(note)}</p>' for note in notes), 'notes') if notes else '',
         _tiles(summary),
         _section('Accuracy', _accuracy(scored)) if result.truth is not None else '',
-        *(_section(title, _image(figures[name], title) + extra) for name, title, extra in (
+        *(_section(title, _data_image('svg+xml', (folder / f'{name}.svg').read_bytes(), title) + extra)
+          for name, title, extra in (
             ('curves', 'How many frames and joints are within a distance', _published(result)),
             ('joints', 'Which joints are hard', _fingers(scored)),
             ('errors', 'When it errs', ''),
@@ -229,10 +230,6 @@ def _table(head: Iterable[str], rows: Iterable[Sequence[str]], text: bool = Fals
 
 def _section(title: str, content: str, kind: str = '') -> str:
     return f'<section class="{kind}"><h2>{escape(title)}</h2>{content}</section>'
-
-
-def _image(figure: Figure, title: str) -> str:
-    return _data_image('svg+xml', plots.to_bytes(figure, 'svg'), title)
 
 
 def _data_image(kind: str, data: bytes, alternative: str) -> str:

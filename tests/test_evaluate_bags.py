@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -419,6 +420,10 @@ def test_processes_that_evaluate_end_with_the_one_that_started_them_and_leave_no
     def children():
         return Path(f'/proc/{whole.pid}/task/{whole.pid}/children').read_text().split()
 
+    def runs(process):
+        with suppress(OSError):  # no longer there
+            return Path(f'/proc/{process}/cmdline').read_bytes() != b''  # as of who has ended, but was not waited for
+
     def wait(until):
         end = time.monotonic() + 60
         while not until() and time.monotonic() < end:
@@ -431,7 +436,7 @@ def test_processes_that_evaluate_end_with_the_one_that_started_them_and_leave_no
     # As `timeout` and service managers do it, SIGTERM goes to all of them, and once more from the one that ends them.
     (os.killpg if number == signal.SIGTERM else os.kill)(whole.pid, number)
     assert 'Traceback' not in whole.communicate(timeout=60)[1]
-    assert wait(lambda: not any(Path(f'/proc/{one}').exists() for one in started))
+    assert wait(lambda: not any(map(runs, started)))
     assert [*tmp_path.glob('hands/*'), *tmp_path.glob('hands/.*')] == []
 
 

@@ -89,7 +89,7 @@ def test_to_view_without_a_display_is_refused_at_once(monkeypatch, capsys):
         monkeypatch.delenv(name, raising=False)
     bag = Path(__file__).parents[1] / 'demo' / 'hand.mcap'
     assert main(['view', str(bag)]) == 1
-    assert '--save FILE.rrd' in capsys.readouterr().err
+    assert 'there is no display for the viewer: write a file with --save FILE.rrd' in capsys.readouterr().err
     monkeypatch.setitem(sys.modules, 'rerun', None)  # else who then says --save only learns that Rerun is missing
     assert main(['view', str(bag)]) == 1
     assert "'.[view]'" in capsys.readouterr().err

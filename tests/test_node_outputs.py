@@ -356,7 +356,7 @@ def test_what_is_live_is_shown_until_ros_ends(rig: Rig) -> None:
     topics = {'/front/depth/image/compressedDepth': picture, '/front/depth/camera_info': camera_info(),
               '/hand/joints': hands}
     publishers = [rig.client.create_publisher(type(message), topic, RELIABLE) for topic, message in topics.items()]
-    depths, shown, rounds = [], [], iter(range(200))
+    depths, shown, rounds = [], [], iter(range(1200))  # a minute at most
 
     def publish() -> None:
         for publisher, message in zip(publishers, topics.values(), strict=True):

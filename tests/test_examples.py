@@ -244,7 +244,7 @@ def test_gripper_names_an_opening_that_cannot_be_used(
         opening: str, said: str, ros_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip('hand_pose_ros.msg', reason='needs ROS 2 and the compiled messages')
     monkeypatch.setattr(sys, 'argv', ['gripper.py', '--ros-args', '-p', f'max_opening{opening}'])
-    with pytest.raises(SystemExit, match=f'.*{said}.*') as end:
+    with pytest.raises(SystemExit, match=said) as end:
         runpy.run_path(str(EXAMPLES / 'gripper.py'), run_name='__main__')
     assert '\n' not in str(end.value)
 

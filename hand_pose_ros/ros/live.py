@@ -160,7 +160,7 @@ class _Listener:
 def _listening(namespace: str, depth_topic: str, image_type: type) -> Iterator[_Listener]:
     listener, executor = _Listener(namespace, depth_topic, image_type), SingleThreadedExecutor()
     executor.add_node(listener.node)
-    done: Future[None] = Future()
+    done: Future = Future()  # not generic with Jazzy
     thread = threading.Thread(target=executor.spin_until_future_complete, args=(done,), daemon=True)
     thread.start()
     try:

@@ -1,4 +1,4 @@
-"""Fixtures for every test: the recorded data, and a ROS domain of one's own."""
+"""Fixtures for every test: the recorded data, weights, and a ROS domain of one's own."""
 
 import itertools
 import os
@@ -23,6 +23,19 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f'no recorded test data in {folder}: set HAND_POSE_DATA to the folder that holds it')
     return folder
+
+
+@pytest.fixture(scope='session')
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A network that has learned nothing, where it does not matter what it says, only that it says something."""
+    import torch
+
+    from hand_pose_ros.models import build
+    from hand_pose_ros.models.checkpoints import save_checkpoint
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp('weights') / 'untrained.safetensors'
+    save_checkpoint(path, build('deep_prior', joints=21), {'skeleton': 'hand21', 'cube_side': 0.3})
+    return path
 
 
 @pytest.fixture

@@ -1,16 +1,22 @@
-"""Weights on the synthetic benchmark: every number is there and follows from the answers."""
+"""Weights on the synthetic benchmark and on datasets: every number is there and follows from the answers."""
+
+import json
 
 import numpy as np
 import pytest
 import torch
+from test_training import folder  # noqa: F401 (a fixture)
 
 from hand_pose_ros.cli import main
+from hand_pose_ros.datasets import joints_in_metres, open_dataset
 from hand_pose_ros.evaluation import benchmark_evaluation
 from hand_pose_ros.evaluation.benchmark_evaluation import _self_knowledge, evaluate_benchmark
 from hand_pose_ros.models import build
-from hand_pose_ros.models.checkpoints import save_checkpoint
+from hand_pose_ros.models.checkpoints import load_checkpoint, save_checkpoint
 from hand_pose_ros.synthetic import benchmark
 from hand_pose_ros.synthetic.generator import LEFT
+
+# ruff: noqa: F811 (a fixture from another file is imported, and then an argument)
 
 
 def test_a_network_is_scored_on_the_frames_with_a_hand(tmp_path):
@@ -100,3 +106,26 @@ def test_weights_for_other_joints_are_refused(tmp_path, capsys):
     with pytest.raises(SystemExit):
         main(['evaluate', 'synthetic-test-v1', '--depth-scale', '0.0001'])
     assert '--depth-scale is for bags' in capsys.readouterr().err
+
+
+def test_a_network_is_scored_on_the_test_frames_of_its_dataset(folder, tmp_path, capsys):
+    weights, json_file = tmp_path / 'own.safetensors', tmp_path / 'result.json'
+    network = build('shallow', joints=16).eval()
+    save_checkpoint(weights, network, {'skeleton': 'icvl16', 'cube_side': 0.25})
+    arguments = ['evaluate', 'icvl', '--root', str(folder), '--device', 'cpu']
+    for split, frames in ((['--split', 'test_1'], 3), ([], 6)):
+        assert main([*arguments, *split, '--model', str(weights), '--json', str(json_file)]) == 0
+        summary = json.loads(json_file.read_text())
+        assert summary['frames'] == frames
+    batch = open_dataset('icvl', 'test', folder).batch(torch.arange(6))
+    cube = batch['cube_center'], batch['cube_side']
+    with torch.no_grad():
+        joints = load_checkpoint(weights).network(batch['patch'])
+    apart = joints_in_metres(joints, *cube) - joints_in_metres(batch['joints'], *cube)
+    assert summary['mean_mm'] == pytest.approx(1000 * float(apart.norm(dim=-1).mean()), abs=0.01)
+
+    assert main([*arguments, '--model', 'hand_dense']) == 1
+    assert 'its joints are those of hand21, but icvl has those of icvl16' in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(['evaluate', 'icvl'])
+    assert 'give its folder with --root' in capsys.readouterr().err

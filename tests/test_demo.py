@@ -12,7 +12,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import torch
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
@@ -23,23 +22,12 @@ from hand_pose_ros.cli.demo import _truth, summarise
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.estimator import HandEstimate
 from hand_pose_ros.geometry import Cube, Intrinsics
-from hand_pose_ros.models import build
-from hand_pose_ros.models.checkpoints import save_checkpoint
 from hand_pose_ros.msg import HandJointsArray
 from hand_pose_ros.ros import live
 from hand_pose_ros.ros.live import Answers
 from hand_pose_ros.skeleton import HAND21, get_skeleton
 
 COUNT = 6
-
-
-@pytest.fixture
-def weights(tmp_path: Path) -> Path:
-    """A network that has learned nothing."""
-    torch.manual_seed(0)
-    path = tmp_path / 'weights.safetensors'
-    save_checkpoint(path, build('deep_prior', joints=21), {'skeleton': 'hand21', 'cube_side': 0.3})
-    return path
 
 
 def write_bag(path: Path) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from hand_pose_ros.cli import VERBS
 from hand_pose_ros.models import build
-from hand_pose_ros.models.checkpoints import load_checkpoint, save_checkpoint
+from hand_pose_ros.models.checkpoints import load_checkpoint
 from hand_pose_ros.skeleton import SKELETONS
 
 CHECKOUT = Path(__file__).resolve().parents[1]
@@ -99,14 +99,12 @@ def test_table_of_parameters_is_that_of_the_node() -> None:
     assert shown[1] == markdown_table(), 'put the output of `hand-pose estimator --parameters` into README.md'
 
 
-def test_table_of_topics_is_that_of_the_node(ros_domain: int, tmp_path: Path) -> None:
+def test_table_of_topics_is_that_of_the_node(ros_domain: int, weights: Path) -> None:
     rclpy = pytest.importorskip('rclpy', reason='needs ROS 2')
     pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
     from rclpy.parameter import Parameter
 
     from hand_pose_ros.ros.node import EstimatorNode
-    weights = tmp_path / 'weights.safetensors'
-    save_checkpoint(weights, build('deep_prior'), {'skeleton': 'hand21', 'cube_side': 0.3})
     options = {'model': str(weights), 'detector': 'region', 'publish_poses': True, 'publish_joint_states': True}
     rclpy.init()
     node = EstimatorNode(parameter_overrides=[Parameter(name, value=value) for name, value in options.items()])

@@ -2,6 +2,7 @@
 
 import importlib
 import re
+import shutil
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,8 +12,7 @@ import pytest
 from hand_pose_ros import __version__
 from hand_pose_ros.cli import doctor, main
 from hand_pose_ros.errors import HandPoseError
-from hand_pose_ros.models import build, checkpoints
-from hand_pose_ros.models.checkpoints import save_checkpoint
+from hand_pose_ros.models import checkpoints
 from hand_pose_ros.resources import resource
 from hand_pose_ros.runtime import finder
 
@@ -20,12 +20,10 @@ PROFILE = resource('config/fastdds_large_images.xml')
 
 
 @pytest.fixture
-def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def weights(weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder of weights that holds the default ones."""
     monkeypatch.setattr(checkpoints, 'WEIGHTS', tmp_path)
-    path = tmp_path / f'{checkpoints.DEFAULT}.safetensors'
-    save_checkpoint(path, build('deep_prior'), {'skeleton': 'hand21', 'cube_side': 0.3})
-    return path
+    return shutil.copy(weights, tmp_path / f'{checkpoints.DEFAULT}.safetensors')
 
 
 def report(capsys: pytest.CaptureFixture[str]) -> tuple[int, dict[str, list[str]]]:

@@ -8,7 +8,6 @@ import sys
 import cv2
 import numpy as np
 import pytest
-import torch
 
 from hand_pose_ros.bags import Bag, BagWriter, read_hands
 from hand_pose_ros.cli import main
@@ -16,22 +15,11 @@ from hand_pose_ros.drawing import FINGER_COLORS
 from hand_pose_ros.estimator import HandPoseEstimator
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.markers import ADD, DELETE, LINE_LIST, SPHERE_LIST
-from hand_pose_ros.models import build
-from hand_pose_ros.models.checkpoints import save_checkpoint
 from hand_pose_ros.skeleton import HAND21
 
 CAMERA = Intrinsics(140.0, 140.0, 80.0, 60.0, 160, 120)
 INTRINSICS = ['--intrinsics', '140', '140', '80', '60']
 STAMPS = [1_700_000_000_000_000_001 + i * 33_000_000 for i in range(6)]
-
-
-@pytest.fixture(scope='module')
-def weights(tmp_path_factory):
-    """A network that has learned nothing: here it matters where its answers go, not what they are."""
-    torch.manual_seed(0)
-    path = tmp_path_factory.mktemp('weights') / 'untrained.safetensors'
-    save_checkpoint(path, build('deep_prior', joints=21), {'skeleton': 'hand21', 'cube_side': 0.3})
-    return path
 
 
 @pytest.fixture(scope='module')

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from hand_pose_ros.bags import Bag, BagWriter, DepthBag, read_hands
 from hand_pose_ros.cli import main
@@ -27,8 +26,6 @@ from hand_pose_ros.evaluation import bag_evaluation
 from hand_pose_ros.evaluation.bag_evaluation import Settings, evaluate_bag, evaluate_bags
 from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.geometry import Cube, Intrinsics
-from hand_pose_ros.models import build
-from hand_pose_ros.models.checkpoints import save_checkpoint
 from hand_pose_ros.skeleton import HAND21, get_skeleton
 
 CAMERA = Intrinsics(240, 240, 159.5, 119.5, 320, 240)
@@ -57,12 +54,8 @@ def record(path, frames=FRAMES, truth=None, step_ns=STEP_NS):
 
 
 @pytest.fixture(scope='module')
-def model(tmp_path_factory):
-    """Weights that were never trained: what is tested is not how good they are."""
-    torch.manual_seed(0)
-    path = tmp_path_factory.mktemp('model') / 'untrained.safetensors'
-    save_checkpoint(path, build('deep_prior', joints=21), {'skeleton': 'hand21', 'cube_side': 0.3})
-    return str(path)
+def model(weights):
+    return str(weights)
 
 
 @pytest.fixture(scope='module')

@@ -12,12 +12,12 @@ import resource
 import struct
 from array import array
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-import torch
 from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
@@ -36,8 +36,6 @@ from hand_pose_ros.depth import (
     encode_rvl,
 )
 from hand_pose_ros.errors import InputError
-from hand_pose_ros.models import build
-from hand_pose_ros.models.checkpoints import save_checkpoint
 from hand_pose_ros.msg import HandJointsArray
 from hand_pose_ros.ros.camera import Camera
 from hand_pose_ros.ros.node import EstimatorNode
@@ -215,11 +213,8 @@ def test_camera_infos(message: CameraInfo, rectified: bool) -> None:
 
 
 @pytest.fixture(scope='module', params=['raw', 'compressedDepth'])
-def node(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[EstimatorNode]:
+def node(request: pytest.FixtureRequest, weights: Path) -> Iterator[EstimatorNode]:
     """A node that is called directly, as DDS would not let half of the messages through, and answers into `said`."""
-    torch.manual_seed(0)
-    weights = tmp_path_factory.mktemp('weights') / 'untrained.safetensors'
-    save_checkpoint(weights, build('deep_prior', joints=21), {'skeleton': 'hand21', 'cube_side': 0.3})
     context = rclpy.Context()
     context.init(domain_id=99)
     values = {'model': str(weights), 'min_score': 0.0, 'camera_info_timeout': 0.0, 'max_hands': 2, 'smoothing': 1.0,

@@ -31,7 +31,6 @@ from test_node import (  # noqa: F401 (fixtures)
     rig,
     stamp_of,
     stamped,
-    weights,
 )
 from visualization_msgs.msg import MarkerArray
 

@@ -6,7 +6,7 @@ import sys
 
 import numpy as np
 import pytest
-from test_estimate import CAMERA, STAMPS, bag, depths, weights  # noqa: F401 (fixtures)
+from test_estimate import CAMERA, STAMPS, bag, depths  # noqa: F401 (fixtures)
 
 from hand_pose_ros.bags import BagWriter
 from hand_pose_ros.cli import main

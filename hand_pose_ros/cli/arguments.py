@@ -92,7 +92,7 @@ def add_bag(parser: Any) -> None:
     parser.add_argument('--camera-info-topic', metavar='TOPIC',
                         help='if it is not the camera_info beside the depth topic')
     parser.add_argument('--intrinsics', nargs=4, type=float, metavar=('FX', 'FY', 'CX', 'CY'),
-                        help='of the camera, in pixels; replace those of camera_info, and are needed for PNGs')
+                        help='of the camera, in pixels; they replace those of camera_info')
     parser.add_argument('--depth-scale', type=metres, default=0.001, metavar='M',
                         help='metres per unit of 16-bit depth (0.001)')
 

@@ -50,7 +50,7 @@ EXAMPLES = """examples:
 
 The .npz has a row for each hand: frame (which image), joints (J,3) in metres, confidence (J), score, side, id,
 cube_center, cube_side; and once: names and stamp_ns of the images, joint_names, skeleton. The .mcap has the topics
-/hand/joints, /hand/markers and /hand/skeleton. PNGs, which have no time, count as 30 Hz.
+/hand/joints, /hand/markers and /hand/skeleton. PNGs need --intrinsics. They have no time and count as 30 Hz.
 """
 _PNG_PERIOD_NS = 33_333_333
 

@@ -70,8 +70,8 @@ def run(args: argparse.Namespace) -> int:
     if args.bag is not None:
         refuse(args, ('transport', 'ros_args'), 'is for live topics')
         return _view_bag(args)
-    refuse(args, ('depth_topic', 'camera_info_topic', *ESTIMATOR, 'max_hands'),
-           'is for bags: choose live topics with --ros-args -r from:=to')
+    refuse(args, ('depth_topic', 'camera_info_topic'), 'is for bags: choose live topics with --ros-args -r from:=to')
+    refuse(args, (*ESTIMATOR, 'max_hands'), 'is for bags: live hands come from the node')
     check_intrinsics(args)
     from hand_pose_ros.ros.watch import watch  # without ROS, this says what is missing
     with Scene(args.save) as scene:

@@ -1,11 +1,11 @@
-"""synthetic-test-v1: 5,000 frames that no training sees, the same for everybody, recreated from their seed.
+"""The benchmark synthetic-test-v1: 5,000 frames that no training sees. All make the same ones from their seeds.
 
     for batch in frames():
         predict(batch['patch']) ...
 
-Frames are those of the split 'test', which shares no hand, pose or other random number with 'train' and 'val'. Their
-identity is a SHA-256 over the first frames. It covers every bit, so it also tells when another version of PyTorch or
-another processor rounds differently; `digest` then still agrees to about a thousandth, and so do results.
+The frames are those of the split 'test', which shares no hand, pose or other random number with 'train' and 'val'. A
+SHA-256 of the first frames identifies them. It covers every bit, so it also changes if another version of PyTorch or
+another processor rounds differently. In that case `digest` and the results still agree to about a thousandth.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ PREFIX = 64
 SENSORS = ('primesense', 'kinect1', 'sr305', 'kinect2', 'azure', 'pmd', 'senz3d', 'd435', 'd415')
 
 PREFIX_SHA256 = '84732b6b16bfdc57aeccfa51c31f5a35e0270e3f35fee90e07f49bf76ba223ff'
-"""Of the first PREFIX frames, made with PREFIX_MADE_WITH."""
+"""SHA-256 of the first PREFIX frames, made with PREFIX_MADE_WITH."""
 PREFIX_MADE_WITH = 'torch 2.13.0, AVX512'
 PREFIX_DIGEST = (0.718286, 0.225034, 0.614583)
 
 
 def frames(number: int = FRAMES, *, device: str | torch.device = 'cpu', batch: int = 64) -> Iterator[dict[str, Tensor]]:
-    """The first `number` frames in batches, as of SyntheticHands.batch."""
+    """The first `number` frames in batches, as `SyntheticHands.batch` returns them."""
     hands = SyntheticHands('test', sensors=SENSORS, device=device)
     for indices in torch.arange(number).split(batch):
         yield hands.batch(indices)
 
 
 def checksum(batch: dict[str, Tensor]) -> str:
-    """SHA-256 of all that a batch holds, keys in alphabetical order."""
+    """SHA-256 of all that a batch holds, with the keys in alphabetical order."""
     digest = hashlib.sha256()
     for key in sorted(batch):
         digest.update(key.encode())
@@ -52,5 +52,5 @@ def digest(batch: dict[str, Tensor]) -> tuple[float, float, float]:
 
 
 def made_with() -> str:
-    """What the last bit of a frame depends on beside this code."""
+    """What the last bits of the frames depend on, besides this code."""
     return f'torch {torch.__version__.split("+")[0]}, {torch.backends.cpu.get_cpu_capability()}'

@@ -1,4 +1,4 @@
-"""Keeps the parts of a hand out of each other: capsules around the bones, and poses nudged until none overlap."""
+"""Keeps the parts of a hand out of each other. Poses are nudged until no capsules around the bones overlap."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from hand_pose_ros.synthetic.kinematics import INDEX, POSE, place_bones
 from hand_pose_ros.synthetic.shapes import Shape, mean_shape
 
 TOLERANCE, SQUEEZE = 0.002, 0.0045
-"""Metres by which capsules may overlap: flesh gives way where parts touch, more so between neighbouring fingers."""
+"""Metres by which capsules may overlap, because flesh gives way where parts touch. SQUEEZE is for two fingers,
+TOLERANCE for all other pairs."""
 
 _ROUNDS = 12
 
@@ -31,7 +32,7 @@ def _average(device: torch.device) -> Shape:
 
 
 def _capsules(shape: Shape, pose: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Ends (B, 19, 3) and (B, 19, 3) and radii (B, 19) of the capsules."""
+    """Both ends (B, 19, 3) and radii (B, 19) of the capsules."""
     metacarpals, bases, _, digits = place_bones(shape, pose)
     inwards = shape.palm_depth[:, None, None] * metacarpals[..., 2]  # (B, 4, 3)
     start = torch.cat([digits[:, :, :3].reshape(-1, 15, 3), bases + 0.35 * inwards], 1)
@@ -52,14 +53,14 @@ def _segment_distance(p: Tensor, q: Tensor, r: Tensor, s: Tensor) -> Tensor:
 
 
 def overlaps(pose: Tensor, shape: Shape | None = None) -> Tensor:
-    """How deep the parts of hands are inside each other beyond what flesh gives way, in metres.
+    """How deep the parts of hands are inside each other, in metres, less what flesh gives way.
 
     Args:
         pose: (B, P) radians.
         shape: B hands, or one for all; the average hand if left out.
 
     Returns:
-        (B, 6, 6), symmetric: digits from thumb to little finger, then the palm; 0 where nothing overlaps.
+        (B, 6, 6), symmetric. The order is thumb to little finger, then palm. 0 means no overlap.
     """
     shape = _average(pose.device) if shape is None else shape
     start, end, radius = _capsules(shape, pose)
@@ -73,10 +74,10 @@ def overlaps(pose: Tensor, shape: Shape | None = None) -> Tensor:
 
 
 def part_contacts(pose: Tensor) -> Tensor:
-    """Poses (B, P) near the given ones in which nothing overlaps (see `overlaps`), for the average hand.
+    """Poses (B, P) near the given ones, in which no parts of the average hand overlap (see `overlaps`).
 
-    The thumb is moved outwards, fingers that meet the palm open, fingers that meet each other come side by side. What
-    is still entangled after some rounds gives way towards an open hand.
+    The thumb moves outwards. Fingers that meet the palm or the thumb open, and fingers that meet each other come side
+    by side. A hand that is still entangled after some rounds moves half-way to an open one, and if need be all the way.
     """
     pose, still = pose.clone(), torch.arange(len(pose), device=pose.device)
     for turn in range(_ROUNDS + 2):
@@ -93,7 +94,7 @@ def part_contacts(pose: Tensor) -> Tensor:
 
 
 def bring_together(pose: Tensor, within: float) -> Tensor:
-    """Poses (B, P) of the average hand, where the thumb is closed until its tip touches the nearest fingertip.
+    """Poses (B, P), in which the thumb of the average hand is moved until its tip touches the nearest fingertip.
 
     Hands whose tips are further than `within` metres from touching stay as they are.
     """
@@ -108,7 +109,7 @@ def bring_together(pose: Tensor, within: float) -> Tensor:
         return ((tips[:, 1:] - tips[:, :1]).norm(dim=-1) - touching).abs().amin(1)
 
     pose, near = pose.clone(), (gap(pose) < within).nonzero()[:, 0]
-    for _ in range(3):  # Newton steps on one number, along its gradient
+    for _ in range(3):  # Newton steps along the gradient of the gap
         value = gap((pose[near, None] + steps).reshape(-1, len(POSE))).reshape(-1, 6)
         slope = (value[:, 1:] - value[:, :1]) / 0.01
         step = (value[:, :1] / (slope.square().sum(1, keepdim=True) + 1e-4)).clamp(max=20) * slope
@@ -121,7 +122,7 @@ _FINGERS = slice(INDEX['index_mcp_flexion'], len(POSE))
 
 
 def _open_hand(like: Tensor) -> Tensor:
-    """(P,) a pose in which nothing can meet: straight fingers, the thumb off the palm."""
+    """A pose (P,) in which no parts meet. The fingers are straight, and the thumb is off the palm."""
     pose = torch.zeros_like(like[0])
     pose[_THUMB] = torch.deg2rad(like.new_tensor([46, 34, 80, 0, 4, 0]))
     return pose

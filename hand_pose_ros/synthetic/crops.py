@@ -21,9 +21,10 @@ def to_cube(points: Tensor, center: Tensor, side: Tensor) -> Tensor:
 
 
 def crop(depth: Tensor, center: Tensor, side: Tensor, view: View) -> Tensor:
-    """geometry.crop for a batch, bit for bit: depth (B, H, W) -> patches (B, 1, 128, 128).
+    """The same as geometry.crop to the last bit, for a batch: depth (B, H, W) -> patches (B, 1, 128, 128).
 
-    Its warp (cv2.warpAffine, nearest) rounds positions to 1/1024 of a pixel and those halves up.
+    The warp of geometry.crop (cv2.warpAffine, nearest) rounds positions to 1/1024 of a pixel, and then to whole pixels,
+    halves up.
     """
     batch, height, width = depth.shape
     at = center.double()
@@ -47,14 +48,16 @@ def crop(depth: Tensor, center: Tensor, side: Tensor, view: View) -> Tensor:
 
 
 def settle(depth: Tensor, view: View, side: float, nearest: int, otherwise: Tensor) -> Tensor:
-    """The rule of hand_pose_ros.detection, without its search for connected pieces: from the nearest surface to the
-    centre of mass of what a cube around it holds, five times.
+    """Where the rule of hand_pose_ros.detection settles, without its search for connected pieces.
+
+    The first guess is the centre of the nearest pixels. Five times, it moves to the centre of mass of what a cube
+    around it holds.
 
     Args:
         depth: (B, H, W) metres, coarse images around one object each.
-        side: of the cube, metres.
-        nearest: so many of the nearest pixels make the first guess.
-        otherwise: (B, 3) for images that hold nothing.
+        side: side of the cube, metres.
+        nearest: number of the nearest pixels that make the first guess.
+        otherwise: (B, 3) metres, the answer for images that hold nothing.
 
     Returns:
         (B, 3) metres.
@@ -64,7 +67,7 @@ def settle(depth: Tensor, view: View, side: float, nearest: int, otherwise: Tens
 
     def centroid(mask: Tensor, values: tuple[Tensor, ...], otherwise: Tensor) -> Tensor:
         count = mask.sum(1)
-        # In double precision the order of the sum does not show.
+        # In double precision, the order of the summands does not change the result.
         x, y, z = (torch.where(mask, value, 0).double().sum(1) / count.clamp(min=1) for value in values)
         return torch.where((count > 0)[:, None], torch.stack([x * z, y * z, z], 1).float(), otherwise)
 

@@ -1,12 +1,16 @@
 """What depth sensors do to a perfect depth image.
 
-Each effect is one small function `(nearness, shot) -> nearness` over 1/z in 1/m (0 = no reading), so that it can be
-shown alone. Triangulating sensors measure disparity, focal length x baseline / z: nearness up to a factor.
+Each effect is one small function `(nearness, shot) -> nearness`, so that it can be shown alone. Nearness is 1/z in 1/m,
+0 = no reading. Triangulating sensors measure disparity, which is focal length x baseline x nearness.
 
-Sources: Handa et al. 2014, "A benchmark for RGB-D visual odometry, 3D reconstruction and SLAM" (ICL-NUIM), for the
-structured-light chain (jitter, matching window, quantised disparity); Nguyen et al. 2012 and Khoshelham and Elberink
-2012 for the noise of the first Kinect; Fankhauser et al. 2015 for the second; Sarbolandi et al. 2015 for flying pixels
-and multipath of time-of-flight cameras; Keselman et al. 2017 for RealSense stereo.
+Sources:
+
+- Handa et al. 2014, "A benchmark for RGB-D visual odometry, 3D reconstruction and SLAM" (ICL-NUIM), for the
+  structured-light chain (jitter, matching window, quantised disparity)
+- Nguyen et al. 2012 and Khoshelham and Elberink 2012 for the noise of the first Kinect
+- Fankhauser et al. 2015 for the noise of the second Kinect
+- Sarbolandi et al. 2015 for flying pixels and multipath of time-of-flight cameras
+- Keselman et al. 2017 for RealSense stereo
 """
 
 from __future__ import annotations
@@ -27,7 +31,10 @@ _KINDS = {'white': 0.0, 'smooth': 2.0, 'blobs': 6.0}  # standard deviation of th
 
 @cache
 def _noise(kind: str, height: int, width: int, device: torch.device) -> Tensor:
-    """A plane tiled with normal noise of unit variance, as a view (_TILE, _TILE, height, width) of all its cuts."""
+    """All cuts of height x width pixels from a tile of normal noise of unit variance, which repeats itself.
+
+    They are a view (_TILE, _TILE, height, width) of one plane.
+    """
     tile = Random(torch.tensor([list(_KINDS).index(kind)])).normal(_TILE, _TILE)[0]
     frequency = torch.fft.fftfreq(_TILE)
     squared = frequency[:, None] ** 2 + frequency[None] ** 2
@@ -39,14 +46,15 @@ def _noise(kind: str, height: int, width: int, device: torch.device) -> Tensor:
 
 @dataclass(frozen=True)
 class Shot:
-    """What the noise of one batch of images depends on; tensors are (B, 1, 1).
+    """What the noise of one batch of images depends on. Tensors are (B, 1, 1).
 
     Attributes:
-        rng: for what differs from image to image; lasting: for what stays while a camera looks at a scene.
+        rng: random numbers for what differs from image to image.
+        lasting: random numbers for what stays while a camera looks at a scene.
         focal: focal length in pixels of the images at hand.
-        scale: its ratio to the sensor's own: below 1 where a window was thinned out.
-        severity: factor on everything random: no two units, rooms and skins are alike.
-        mirrored: bool, whether the image is to be mirrored afterwards, so that the projector is on the other side.
+        scale: `focal` over the focal length of the sensor. It is below 1 where an image was thinned out.
+        severity: how strong most effects are, because no two sensors, rooms and skins are alike.
+        mirrored: bool, whether the image is mirrored afterwards. If so, the projector is on the other side.
         baseline, noise, step, smoothing: see sensors.Sensor.
     """
 
@@ -71,7 +79,7 @@ class Shot:
     def field(self, kind: str) -> Tensor:
         """(B, H, W) normal noise of unit variance: 'white', 'smooth' (over 2 px) or the lasting 'blobs' (6 px).
 
-        Cut at random from a fixed tile: many times faster than a random number per pixel.
+        It is cut at random from a fixed tile, which is many times faster than a random number per pixel.
         """
         rng = self.lasting if kind == 'blobs' else self.rng
         row, column = (rng.uniform(2) * _TILE).long().unbind(1)
@@ -90,7 +98,7 @@ def _spread(nearness: Tensor, combine: Callable[[Tensor, Tensor], Tensor] = torc
 
 
 def _mean(nearness: Tensor) -> Tensor:
-    """Mean over 3x3 pixels (the image repeated at its border)."""
+    """Mean over 3x3 pixels. Beyond the border, the pixels at the border are repeated."""
     for axis in (1, 2):
         length = nearness.shape[axis]
         padded = torch.cat([nearness.narrow(axis, 0, 1), nearness, nearness.narrow(axis, length - 1, 1)], axis)
@@ -100,9 +108,10 @@ def _mean(nearness: Tensor) -> Tensor:
 
 
 def _slope(nearness: Tensor, shot: Shot) -> Tensor:
-    """Squared tangent of the angle of incidence; steps between surfaces do not count (the flatter side of each pixel).
+    """Squared tangent of the angle of incidence.
 
-    For a plane, nearness is N . ray, so its gradient in ray slopes is (N_x, N_y) and tan^2 = |gradient|^2 / nearness^2.
+    Along each axis, a pixel takes the flatter of its two sides, so that steps between surfaces do not count. For a
+    plane, nearness is N . ray, so its gradient in ray slopes is (N_x, N_y) and tan^2 = |gradient|^2 / nearness^2.
     """
     total = torch.zeros_like(nearness)
     for axis in (1, 2):
@@ -117,7 +126,7 @@ def _slope(nearness: Tensor, shot: Shot) -> Tensor:
 
 
 def jitter(nearness: Tensor, shot: Shot) -> Tensor:
-    """Lateral noise: pixels look beside themselves by N(0, 0.5 px) of the sensor, which frays edges (Handa 2014)."""
+    """Lateral noise, which frays edges: each pixel looks N(0, 0.5 px) of the sensor beside itself (Handa 2014)."""
     reach = 0.5 * shot.scale * shot.severity
     across = (shot.field('smooth') * reach).round().long()
     down = (shot.field('smooth') * reach).round().long()
@@ -127,10 +136,10 @@ def jitter(nearness: Tensor, shot: Shot) -> Tensor:
 
 
 def shadow(nearness: Tensor, shot: Shot) -> Tensor:
-    """What the projector (or second camera) cannot see has no reading: shadows beside silhouettes on one side.
+    """Shadows beside silhouettes, on one side. What the projector (or second camera) cannot see has no reading.
 
-    A projector at +b sees the pixel u at u - disparity. Along a row that must grow; where it falls back, a nearer
-    surface further right is in the way.
+    A projector at +b sees the pixel u at u - disparity. If it sees a pixel further right in the row more than 1 px
+    further left than u, that pixel is nearer and in the way, and u has no reading.
     """
     sign = torch.where(shot.mirrored, -1, 1)
     facing = torch.where(sign > 0, nearness.flip(2), nearness)  # now the projector is on the left
@@ -141,7 +150,7 @@ def shadow(nearness: Tensor, shot: Shot) -> Tensor:
 
 
 def matching_window(nearness: Tensor, shot: Shot) -> Tensor:
-    """A window of the pattern that straddles two surfaces matches neither: ragged holes along steps (Handa 2014)."""
+    """Ragged holes along steps, because a window of the pattern on two surfaces matches neither (Handa 2014)."""
     behind = _spread(nearness) - nearness > 0.03 * nearness
     before = nearness - _spread(nearness, torch.minimum) > 0.03 * nearness
     luck = shot.field('smooth') + 0.5 * shot.field('white')
@@ -151,9 +160,9 @@ def matching_window(nearness: Tensor, shot: Shot) -> Tensor:
 
 
 def disparity_noise(nearness: Tensor, shot: Shot) -> Tensor:
-    """Noise of the disparity, smooth since windows overlap, then its quantum: in depth both grow with z^2.
+    """Noise of the disparity, and its rounding to a step.
 
-    (Khoshelham and Elberink 2012.)
+    The noise is smooth, because windows overlap. In depth, both grow with z^2 (Khoshelham and Elberink 2012).
     """
     noise = (0.9 * shot.field('smooth') + 0.4 * shot.field('white')) * (shot.noise * shot.severity)
     disparity = ((nearness * shot.disparity_per_nearness + noise) / shot.step).round() * shot.step
@@ -161,7 +170,7 @@ def disparity_noise(nearness: Tensor, shot: Shot) -> Tensor:
 
 
 def grazing_holes(nearness: Tensor, shot: Shot) -> Tensor:
-    """Too little light comes back from grazing surfaces; beyond about 75 degrees most readings fail (Nguyen 2012)."""
+    """Grazing surfaces send too little light back. Beyond about 75 degrees, most readings fail (Nguyen 2012)."""
     limit = 4.0 + 1.2 * shot.field('smooth')
     limit = (limit / shot.severity).clamp(min=1.5)
     return torch.where(_slope(nearness, shot) < limit * limit, nearness, 0)
@@ -176,8 +185,11 @@ def dark_spots(nearness: Tensor, shot: Shot) -> Tensor:
 
 
 def edge_smear(nearness: Tensor, shot: Shot) -> Tensor:
-    """A pixel gathers light from more than its own square, and the nearer surface sends more: silhouettes grow by about
-    a pixel, and their outermost pixels lie 5-40 mm too deep (measured on recordings of a second Kinect)."""
+    """Silhouettes grow by about a pixel, because a pixel gathers light from more than its own square.
+
+    The nearer surface sends more of this light. The outermost pixels of silhouettes lie 5-40 mm too deep (measured on
+    recordings of a second Kinect).
+    """
     amount = shot.scale * (0.5 + shot.lasting.uniform(1, 1))
     within = nearness - ((nearness - _mean(nearness)) * (0.12 * amount)).clamp(max=0.03)
     front = _spread(nearness)
@@ -187,20 +199,20 @@ def edge_smear(nearness: Tensor, shot: Shot) -> Tensor:
 
 
 def flying_pixels(nearness: Tensor, shot: Shot) -> Tensor:
-    """At a step of some centimetres a pixel mixes both surfaces: dropped by the driver's filter, or anywhere between.
+    """At a step of some centimetres, a pixel mixes both surfaces (Sarbolandi et al. 2015, section 4).
 
-    (Sarbolandi et al. 2015, section 4.)
+    Either the filter of the driver drops it, or it lies anywhere between the surfaces.
     """
     front, back = _spread(nearness), _spread(nearness, torch.minimum)
     behind = front - nearness > 0.06 * front
     luck = shot.field('white') + shot.field('smooth')
-    kept = 2.0 + 2.0 * shot.lasting.uniform(1, 1)  # how sharp the driver's filter is set
+    kept = 2.0 + 2.0 * shot.lasting.uniform(1, 1)  # how strict the driver's filter is
     between = back + (0.5 + 0.35 * shot.field('white')).clamp(0, 1) * (front - back)
     return torch.where(behind & (luck > -2.0), torch.where(luck > kept, between, 0), nearness)
 
 
 def multipath(nearness: Tensor, shot: Shot) -> Tensor:
-    """Light that bounces inside a hollow (a cupped palm) arrives late: the hollow is seen too deep by millimetres."""
+    """Light that bounces inside a hollow (a cupped palm) arrives late, so the hollow seems too deep by millimetres."""
     size = (shot.height, shot.width)
     around = functional.avg_pool2d(nearness[:, None], 8, ceil_mode=True)
     around = functional.interpolate(around, size, mode='bilinear')[:, 0]
@@ -212,7 +224,8 @@ def multipath(nearness: Tensor, shot: Shot) -> Tensor:
 def tof_noise(nearness: Tensor, shot: Shot) -> Tensor:
     """Axial noise of the second Kinect (Fankhauser 2015).
 
-    In mm, sigma = 1.5 - 0.5 z + 0.3 z^2 + 0.1 z^1.5 theta^2 / (pi/2 - theta)^2; the last fraction is written as tan^2.
+    In mm, sigma = 1.5 - 0.5 z + 0.3 z^2 + 0.1 z^1.5 theta^2 / (pi/2 - theta)^2. Here, tan^2 theta replaces the last
+    fraction.
     """
     z = 1 / nearness.clamp(min=0.1)
     tangent2 = _slope(nearness, shot).clamp(max=40)
@@ -223,13 +236,13 @@ def tof_noise(nearness: Tensor, shot: Shot) -> Tensor:
 
 
 def fattening(nearness: Tensor, shot: Shot) -> Tensor:
-    """Block matching gives the pixels beside a near surface its disparity: silhouettes bulge here and there."""
+    """Silhouettes bulge here and there, because block matching gives the pixels beside a near surface its disparity."""
     return torch.where(shot.field('smooth') > 0.3 - 0.6 * shot.scale * shot.severity,
                        _spread(nearness), nearness)
 
 
 def smoothing(nearness: Tensor, shot: Shot) -> Tensor:
-    """The driver's spatial and temporal filters: a mean within surfaces, none across steps."""
+    """The driver's spatial and temporal filters, as a mean within surfaces but not across steps."""
     front, back = _spread(nearness), _spread(nearness, torch.minimum)
     inside = front - back < 0.04 * front
     return nearness + torch.where(inside, (_mean(nearness) - nearness) * shot.smoothing, 0)

@@ -12,9 +12,10 @@ from hand_pose_ros.synthetic.scenes import VIEWS, Scene, Solid, cross, normalize
 
 
 class Furnisher:
-    """Adds things to a scene, each from random streams of its own.
+    """Adds things to a scene. Each draws from a random stream of its own.
 
-    What the hand holds and wears goes with it; everything else stands where it fits the scene `around`.
+    The arm, and what the hand holds and wears, move with the hand. Everything else is placed to fit the hands of the
+    scene `around`.
     """
 
     def __init__(self, rng: Random, scene: Scene, view: Tensor, elbow: Tensor, around: Scene) -> None:
@@ -28,7 +29,7 @@ class Furnisher:
         return self.rng.fork(self._stream)
 
     def _chance(self, rng: Random, shares: dict[str, float]) -> Tensor:
-        """(K,) samples chosen with a probability for each of VIEWS."""
+        """Samples (K,), chosen with the share of their view, or with that of 'any' for views that have no own share."""
         table = torch.tensor([shares.get(name, shares['any']) for name in VIEWS], device=rng.device)
         return (rng.uniform() < table[self.view]).nonzero()[:, 0]
 
@@ -51,7 +52,7 @@ class Furnisher:
                         torch.stack([start, end], 1), torch.stack([radius, end_radius], 1)))
 
     def surface(self) -> None:
-        """A table under the hand or a wall behind it: a plane that arm and hand touch or stay clear of."""
+        """A table under the hand or a wall behind it, as a plane that arm and hand touch or stay clear of."""
         rng = self._draws()
         samples = self._chance(rng, {'overhead': 0.8, 'egocentric': 0.6, 'any': 0.35})
         down = torch.tensor([0.0, 0.75, 0.66], device=rng.device)
@@ -64,7 +65,7 @@ class Furnisher:
         self.scene.soft.append(Solid(renderer.plane, samples, (normal[samples], (touch + gap)[samples])))
 
     def body(self, arm: bool) -> None:
-        """Torso and head of the person whose hand it is, behind the hand, and the upper arm, with or without them."""
+        """In some samples, torso and head of the person behind the hand. With `arm`, all hands have an upper arm."""
         rng = self._draws()
         samples = self._chance(rng, {'overhead': 0.1, 'egocentric': 0.05, 'any': 0.6})
         size = rng.uniform(3, low=0.85, high=1.15)
@@ -119,7 +120,7 @@ class Furnisher:
         self._box(self.scene.hard, (chosen & (what >= 0.75)).nonzero()[:, 0], center, frame, half)
 
     def clutter(self) -> None:
-        """Things behind, beside and before the hand."""
+        """Things behind, beside and in front of the hand."""
         for chance, before in ((0.25, False), (0.25, False), (0.07, True)):
             rng = self._draws()
             chosen, what = rng.chance(chance), rng.uniform()
@@ -139,7 +140,7 @@ class Furnisher:
                       thin, thin * 1.2)
 
     def no_hand(self) -> None:
-        """Where there is no hand: an elbow, a forearm's stump, a head or an object in its place."""
+        """Where there is no hand, mostly an elbow, the stump of a forearm, a head or an object in its place."""
         rng = self._draws()
         absent, what = ~self.scene.present, rng.uniform()
         axes = random_rotation(rng)
@@ -155,17 +156,17 @@ class Furnisher:
 
 def furnish(rng: Random, scene: Scene, view: Tensor, elbow: Tensor, around: Scene | None = None, *,
             arm: bool = True, alone: bool = False) -> None:
-    """Fill scenes with what else there is.
+    """Fill scenes with what there is besides the hands.
 
     Args:
-        view: (B,) as of `sample_views`.
+        view: (B,) the second result of `sample_views`.
         elbow: (B, 3) in metres.
-        around: where the hands were when the rest was put in place (they may move); as they are now by default.
-        arm: whether the hands have arms, which then may be clothed.
+        around: the scene with the hands where the rest was put in place, because hands may move; `scene` by default.
+        arm: whether the hands have arms. If so, they may be clothed.
         alone: leave out what may cover or imitate a hand.
     """
     furnisher = Furnisher(rng, scene, view, elbow, around or scene)
-    # Each draws from the next stream of random numbers: the order matters.
+    # Each draws from the next stream of random numbers, so the order matters.
     furnisher.surface()
     furnisher.body(arm)
     if arm:

@@ -1,9 +1,9 @@
-"""Labelled depth hands without end: hand, scene, camera, noise, and the crop that the product would make.
+"""Endless labelled depth images of hands: hand, scene, camera, noise, and the crop that the product would make.
 
     hands = SyntheticHands('train')
     sample = hands.batch(torch.arange(64))        # patch, joints, ... of samples 0 to 63 of the training split
 
-A sample depends on its split and index alone: not on the batch it is in, nor on what was made before.
+A sample depends on its split and index only. It does not depend on its batch, nor on what was made before.
 """
 
 from __future__ import annotations
@@ -28,9 +28,10 @@ from hand_pose_ros.synthetic.stages import CROP, CUBE_SIDE, WINDOW_AT, Ingredien
 SPLITS = ('train', 'val', 'test')
 LEFT, RIGHT = 1, 2  # as in the message HandJoints
 
-_ELSEWHERE = 0.12  # share of samples with a hand whose cube is to be of something else, where there is anything
+_ELSEWHERE = 0.12  # of the samples with a hand, the share whose cube shows something else, if there is anything else
 
-# Behind its surface lies a joint that can be seen: at most about its flesh (m, for a hand of 0.175 m).
+# A joint is visible only if it lies at most this far behind the surface that is seen. This is about the thickness of
+# its flesh (m, for a hand of 0.175 m).
 _FLESH = torch.tensor([0.034] + [0.034, 0.024, 0.016, 0.015] + [0.026, 0.017, 0.015, 0.014] * 4)
 
 
@@ -38,14 +39,15 @@ class SyntheticHands:
     """Samples of one split.
 
     Args:
-        split: 'train', 'val' or 'test': no two share a hand, a pose or any other random number.
-        seed_base: another value gives another, equally disjoint, family of splits.
-        device: where everything happens.
+        split: 'train', 'val' or 'test'. No two splits share a hand, a pose or any other random number.
+        seed_base: each value has its own three splits, which share nothing with those of other values.
+        device: where the samples are made.
         sensors: names of the sensors to draw from, equally often; all by default.
-        ingredients: see Ingredients.
-        hand: whose skin; the parametric hand by default, else for example a `rig.Rig`.
-        chunk: samples worked on at a time, which does not change any; by default 64, which fit the caches of a CPU, or
-            on a GPU 2,048: there it takes longer to say what is to be done than to do it for a few.
+        ingredients: what makes the hands real, see `Ingredients`; all by default.
+        hand: the hand whose skin is drawn, for example a `rig.Rig`; the parametric hand by default.
+        chunk: number of samples that are made at a time, which does not change them. By default it is 64 on a CPU,
+            because these fit its caches. On a GPU it is 2,048, because there it takes longer to start the work on a few
+            samples than to do it.
 
     Raises:
         HandPoseError: an unknown split or sensor.
@@ -69,13 +71,13 @@ class SyntheticHands:
         """The samples of these indices (B,), int64 >= 0.
 
         Returns:
-            patch: (B, 1, 128, 128) float32 in [-1, 1], as geometry.crop makes it; a left hand's is mirrored, so that a
-                network only ever sees right hands.
-            joints: (B, 21, 3) hand21 in the patch's cube units (see geometry.Cube), mirrored with it.
+            patch: (B, 1, 128, 128) float32 in [-1, 1], as geometry.crop makes it. That of a left hand is mirrored, so
+                that a network sees right hands only.
+            joints: (B, 21, 3) hand21 in the cube units of the patch (see geometry.Cube), mirrored if the patch is.
             joints_m: (B, 21, 3) metres, optical frame, as they are in the scene.
             cube_center (B, 3), cube_side (B,): metres, optical frame, as in the scene.
-            visible: (B, 21) bool, whether the joint's skin is what the camera sees there.
-            hand_present: (B,) bool; joints are 0 and invisible where there is none.
+            visible: (B, 21) bool, whether what the camera sees at the joint is the skin of this joint.
+            hand_present: (B,) bool, whether the crop is of a hand. If not, all joints are 0 and not visible.
             side: (B,) int64, 1 = left, 2 = right in the scene.
             sensor: (B,) int64, index in sensors.SENSORS.
         """
@@ -105,12 +107,14 @@ class SyntheticHands:
     def scenes(self, indices: Tensor, focal: float, width: int, height: int) -> dict[str, Tensor]:
         """Images of the whole scene of each sample (B,), thinned out to a focal length in pixels.
 
-        An image is a window of width x height pixels somewhere over the sensor's image, which may be smaller.
+        Each image is a window of width x height pixels at a random place of the sensor's image. The sensor's image may
+        be smaller than the window.
 
         Returns:
-            depth: (B, height, width) metres, 0 = no reading or beside the sensor's image.
-            hands: (B, 2, 3) the middle of the hand and of a second one: column, row, metres.
-            shown: (B, 2) bool, whether that hand is there and its middle in the image.
+            depth: (B, height, width) metres, 0 = no reading, or outside the sensor's image.
+            hands: (B, 2, 3) column (px), row (px) and depth (m) of the middles of the hand and of a second hand; 0
+                if not shown.
+            shown: (B, 2) bool, whether that hand is there and its middle lies in the image.
         """
         indices = indices.to(self.device, torch.int64)
         parts = [self._scenes(self._first_seed + some, focal, width, height) for some in indices.split(self.chunk)]
@@ -151,8 +155,8 @@ class SyntheticHands:
     def _cubes(self, stage: Stage) -> tuple[Tensor, Tensor, Tensor]:
         """Centres (B, 3) and sides (B,) of the crops, and whether they are of a hand (B,).
 
-        Half are as the detector finds the hand and half as tracking would; some are of something else in the scene,
-        from which a network learns to tell a hand from an elbow, a head or a table.
+        About half are where the detector finds the hand, and half where tracking would have it. Some are of something
+        else in the scene, so that a network learns to tell a hand from an elbow, a head or a table.
         """
         rng = Random(stage.seeds).fork(CROP)
         middle = stage.scene.joints.mean(1)
@@ -163,7 +167,7 @@ class SyntheticHands:
         tracked = middle + (rng.normal(3, std=0.008) * tail).clamp(-0.025, 0.025)
         present, elsewhere = stage.scene.present, rng.chance(_ELSEWHERE) & stage.scene.present
         if stage.scene.others is not None:
-            elsewhere[stage.scene.others.samples] = False  # what else is there may be a hand
+            elsewhere[stage.scene.others.samples] = False  # the something else could be a second hand
         found = self._stages.detect(stage, elsewhere) + rng.normal(3, std=0.003)
         off = to_cube(middle[:, None], found, torch.full_like(side, CUBE_SIDE))[:, 0].abs().amax(1)
         elsewhere &= off > 1.2
@@ -186,7 +190,7 @@ class SyntheticHands:
     def full_frame(self, index: int) -> tuple[NDArray[np.float32], Intrinsics, NDArray[np.float32], str]:
         """A whole image of sample `index`: depth (H, W) in metres, its camera, joints_m (21, 3), 'left' or 'right'.
 
-        The side is 'none' and the joints 0 where there is no hand.
+        If there is no hand, the side is 'none' and the joints are 0.
         """
         stage = self._stages.build(torch.tensor([self._first_seed + index], device=self.device))
         return self._whole(stage)
@@ -194,9 +198,10 @@ class SyntheticHands:
     @torch.no_grad()
     def sequence(self, index: int, frames: int, *, frames_per_key: int = 24,
                  ) -> Iterator[tuple[NDArray[np.float32], Intrinsics, NDArray[np.float32], str]]:
-        """A hand held up to the camera that moves smoothly, as `full_frame`s; the rest of the scene stands still.
+        """Frames like those of `full_frame`, of a hand that is held up to the camera and moves smoothly.
 
-        Poses, small turns and shifts are drawn every `frames_per_key` frames and joined by cosines.
+        Poses, small turns and shifts are drawn every `frames_per_key` frames and joined by cosines. The rest of the
+        scene stands still.
         """
         seeds = torch.tensor([self._first_seed + index], device=self.device)
         keys = Motion.draw(seeds, frames // frames_per_key + 2)

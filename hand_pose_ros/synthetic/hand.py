@@ -1,4 +1,4 @@
-"""A right hand with a forearm: shape and pose in, skin and joints out. Frame and angles: see `kinematics`."""
+"""A right hand with a forearm: shape and pose in, skin and joints out. `kinematics` tells its frame and angles."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hand_pose_ros.synthetic.shapes import Shape, mean_shape
 
 
 def rest_pose() -> Tensor:
-    """(P,) radians: the pose in which the surface is modelled, fingers apart and straight, thumb half-way out."""
+    """The pose (P,) in which the surface is modelled, in radians: fingers apart and straight, thumb half-way out."""
     pose = torch.zeros(len(POSE))
     for name, degrees in (('index_mcp_abduction', 13), ('ring_mcp_abduction', 12), ('pinky_mcp_abduction', 22),
                           ('thumb_cmc_radial', 42), ('thumb_cmc_palmar', 28), ('thumb_cmc_roll', 70)):
@@ -76,8 +76,8 @@ class SkinnedHand(nn.Module):
         linear = (rotations * bone_sizes(shape)[:, :, None]) @ self._to_bone  # (B, K, 3, 3)
         shift = origins - (linear @ self._origins[..., None])[..., 0]
         transforms = torch.cat([linear, shift[..., None]], -1).transpose(1, 2).reshape(3 * len(pose), -1)  # (3B, 4K)
-        # Padded to a multiple of 8 hands: a product of few rows is summed in another order than one of many, and a hand
-        # must not depend on the batch it is in.
+        # Padded to a multiple of 8 hands. A hand must not depend on the batch it is in, but a product of few rows is
+        # summed in another order than one of many.
         padded = nn.functional.pad(transforms, (0, 0, 0, -len(transforms) % 24))
         skin = (padded @ self._basis)[:len(transforms)].reshape(len(pose), 3, -1)
         return skin.transpose(1, 2).contiguous(), joints

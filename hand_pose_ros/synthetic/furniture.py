@@ -161,7 +161,7 @@ def furnish(rng: Random, scene: Scene, view: Tensor, elbow: Tensor, around: Scen
     Args:
         view: (B,) the second result of `sample_views`.
         elbow: (B, 3) in metres.
-        around: the scene with the hands where the rest was put in place, because hands may move; `scene` by default.
+        around: the scene with the hands as they were when the rest was placed, if they move; `scene` by default.
         arm: whether the hands have arms. If so, they may be clothed.
         alone: leave out what may cover or imitate a hand.
     """

@@ -1,8 +1,8 @@
 """The bones of the hand: names of the angles, and where they carry each bone.
 
-Hand frame: metres, right hand, origin in the wrist, +y along the metacarpal of the middle finger towards the fingers,
-+x towards the thumb, +z = x cross y. For a right hand +z comes out of the *palm* (flexion moves the fingers towards
-+z): seen from the palm with the fingers up, the thumb is on the right.
+The hand frame is that of a right hand, in metres. Its origin is in the wrist, +y runs along the metacarpal of the
+middle finger towards the fingers, +x points towards the thumb, and +z is x cross y. So +z comes out of the *palm*, and
+flexion moves the fingers towards +z. Seen from the palm with the fingers up, the thumb is on the right.
 """
 
 from __future__ import annotations
@@ -21,10 +21,13 @@ POSE = (
       for angle in ('mcp_flexion', 'mcp_abduction', 'pip_flexion', 'dip_flexion')))
 """Names of the P = 26 angles of a pose (B, P), in radians.
 
-Flexion is positive towards the palm. Deviation of the wrist is positive towards the thumb. Abduction of a finger is
-positive away from the middle finger (of the middle finger: towards the thumb; of the thumb: away from the index
-finger). The metacarpal of the thumb leaves the direction of the fingers by `radial` within the plane of the palm and
-by `palmar` out of it; `roll` turns its pad from facing as the palm does (0) to facing the little finger (pi/2).
+- Flexion is positive towards the palm.
+- Deviation of the wrist is positive towards the thumb.
+- Abduction of a finger is positive away from the middle finger. That of the middle finger is positive towards the
+  thumb, and that of the thumb away from the index finger.
+- The metacarpal of the thumb leaves the direction of the fingers by `radial` within the plane of the palm, and by
+  `palmar` out of it. `roll` turns the pad of the thumb from facing as the palm does (0) to facing the little finger
+  (pi/2).
 """
 
 INDEX = {name: i for i, name in enumerate(POSE)}
@@ -35,12 +38,12 @@ BONES = ('forearm', 'wrist', 'carpus', *(f'{f}_metacarpal' for f in FINGERS[1:])
 
 DIGIT = tuple(BONES.index(f'{finger}_joint1') for finger in FINGERS)
 METACARPAL = (BONES.index('carpus'), *(BONES.index(f'{finger}_metacarpal') for finger in FINGERS[1:]))
-"""Of each digit, thumb to little finger: the first of its six frames, and the frame it hangs on."""
+"""For each digit, thumb to little finger, DIGIT is the first of its six frames and METACARPAL the frame it hangs on."""
 
 _RADIAL = (-1.0, -1.0, 1.0, 1.0)  # sign of the rotation about +z that abducts index, middle, ring and little finger
-_CMC_X, _CMC_Y = (0.50, 1.0, 0.63, 0.56), (0.165, 0.165, 0.175, 0.19)  # CMC over MCP, in x and y
-_SPLAY = (-1.5, 0.0, 2.5, 6.0)   # degrees about +z: directions of the fingers at abduction 0 ...
-_LEAN = (-5.0, 0.0, 4.0, 9.0)   # ... and about +y, positive leaning towards the thumb: the fingers of a fist converge
+_CMC_X, _CMC_Y = (0.50, 1.0, 0.63, 0.56), (0.165, 0.165, 0.175, 0.19)  # x and y of the CMC over those of the MCP
+_SPLAY = (-1.5, 0.0, 2.5, 6.0)   # directions of the fingers at abduction 0, in degrees about +z ...
+_LEAN = (-5.0, 0.0, 4.0, 9.0)   # ... and about +y, positive towards the thumb, so that the fingers of a fist converge
 
 
 def _axis_rotation(axis: int, angle: Tensor) -> Tensor:
@@ -53,12 +56,15 @@ def _axis_rotation(axis: int, angle: Tensor) -> Tensor:
 
 
 def _wrist_rotation(pose: Tensor) -> Tensor:
-    """(B, 3, 3): how the forearm turns while the hand stays."""
+    """Rotations (B, 3, 3) of the forearm. The hand stays."""
     return _axis_rotation(0, -pose[:, INDEX['wrist_flexion']]) @ _axis_rotation(2, pose[:, INDEX['wrist_deviation']])
 
 
 def _joint_rotations(pose: Tensor) -> tuple[Tensor, list[Tensor]]:
-    """Turns of the ring and little CMC in (B, 4, 3, 3), and of the three joints of each digit (B, 5, 3, 3)."""
+    """Rotations of the CMC of the four fingers (B, 4, 3, 3), and of the three joints of each digit, (B, 5, 3, 3) each.
+
+    Of the CMC, only those of ring and little finger turn.
+    """
     angle = {name: pose[:, i] for name, i in INDEX.items()}
     still = torch.zeros_like(pose[:, 0])
     cmc = _axis_rotation(0, torch.stack([still, still, angle['ring_cmc_flexion'], angle['pinky_cmc_flexion']], -1))
@@ -76,7 +82,7 @@ def _joint_rotations(pose: Tensor) -> tuple[Tensor, list[Tensor]]:
 
 
 def metacarpal_bases(shape: Shape) -> Tensor:
-    """(B, 4, 3) carpometacarpal joints of the index to little finger."""
+    """The carpometacarpal joints (B, 4, 3) of index to little finger."""
     roots = shape.roots[:, 1:]
     x, y = roots.new_tensor(_CMC_X), roots.new_tensor(_CMC_Y)
     return torch.stack([roots[..., 0] * x, roots[..., 1] * y, roots[..., 2] * 0.3], -1)
@@ -86,8 +92,12 @@ def place_bones(shape: Shape, pose: Tensor) -> tuple[Tensor, Tensor, list[Tensor
     """Where pose (B, P) carries the bones of B hands (or of one, for all).
 
     Returns:
-        Rotations of the metacarpals (B, 4, 3, 3) and their origins (B, 4, 3), index to little finger; for what the
-        digits hang on and their three bones a rotation (B, 5, 3, 3) each; joints of the digits (B, 5, 4, 3), tips last.
+        Four things:
+
+        - rotations of the metacarpals of index to little finger (B, 4, 3, 3)
+        - origins of these metacarpals (B, 4, 3)
+        - four rotations (B, 5, 3, 3), of what the digits hang on and of their three bones
+        - joints of the digits (B, 5, 4, 3), tips last
     """
     batch = len(pose)
     cmc, turns = _joint_rotations(pose)
@@ -118,8 +128,11 @@ def forward(shape: Shape, pose: Tensor, rest: Tensor) -> tuple[Tensor, Tensor, T
         rest: (P,) the pose from which the 'joint' frames turn half-way.
 
     Returns:
-        Rotations (B, K, 3, 3) from the frame of each of the `BONES` (y along the bone, z palmar) to the hand frame;
-        origins (B, K, 3) in metres; joints (B, 21, 3) in the order of hand21, in metres.
+        Three things:
+
+        - rotations (B, K, 3, 3) from the frame of each of the `BONES` (y along the bone, z palmar) to the hand frame
+        - origins of these frames (B, K, 3) in metres
+        - joints (B, 21, 3) in the order of hand21, in metres
     """
     batch = len(pose)
     metacarpal, bases, bones, digits = place_bones(shape, pose)
@@ -136,7 +149,7 @@ def forward(shape: Shape, pose: Tensor, rest: Tensor) -> tuple[Tensor, Tensor, T
 
 
 def bone_sizes(shape: Shape) -> Tensor:
-    """(B, K, 3) width, length and depth of each bone with its flesh, in metres: the skin scales with them."""
+    """Width, length and depth (B, K, 3) of each bone with its flesh, in metres. The skin scales with them."""
     batch = len(shape)
     carpus = torch.stack([shape.hand_breadth / 2, shape.roots[:, 2, 1], shape.palm_depth], -1)
     forearm = torch.stack([shape.forearm[:, 1], shape.forearm[:, 0], shape.forearm[:, 1]], -1)

@@ -1,9 +1,9 @@
-"""What hands do: prototypes, mixtures of them, and wide random poses, within the limits of the joints.
+"""The poses of hands: gestures, mixtures of two, and wide random poses, all within the limits of the joints.
 
-Limits and couplings are those of the biomechanics literature (Sancho-Bru, clinical ranges). How far apart the four
-fingers bend was set to agree with statistics (means, correlations and percentiles, no pose) of the Apache-2.0 pose
-bank of Intel's hand_tracking_samples: its wrists are bent back by 15 degrees on average, and neighbouring fingers
-bend with a correlation of 0.85 to 0.95, index and little finger with 0.65.
+Limits and couplings are those of the biomechanics literature (Sancho-Bru, clinical ranges). How
+differently the four fingers bend was set to agree with statistics of the pose bank of Intel's hand_tracking_samples
+(Apache-2.0). Only means, correlations and percentiles were used, and no pose. There, wrists are bent back by 15 degrees
+on average. Neighbouring fingers bend with a correlation of 0.85 to 0.95, and index and little finger with one of 0.65.
 """
 
 from __future__ import annotations
@@ -97,11 +97,11 @@ def _prototype(curls: str, spread: str, thumb: str) -> Tensor:
 
 
 PROTOTYPES = torch.stack([_prototype(*row[1:]) for row in _TABLE])
-"""(N, P) the gestures that poses are mixed from, before couplings, radians."""
+"""The gestures (N, P) that poses are mixed from, in radians, before couplings."""
 
 
 def _gestures(rng: Random) -> Tensor:
-    """One prototype, or something between two of them, each finger on its own way at times."""
+    """One prototype, or a pose between two of them. At times, each digit is at another point between the two."""
     table, weights = PROTOTYPES.to(rng.device), torch.tensor([row[0] for row in _TABLE])
     first, second = table[rng.choice(weights)], table[rng.choice(weights)]
     way = torch.where(rng.chance(0.45, 1), torch.zeros(()), rng.uniform(1))
@@ -114,12 +114,12 @@ def _gestures(rng: Random) -> Tensor:
 
 
 def _anything(rng: Random) -> Tensor:
-    """Wide random poses: how much a hand closes, how much each finger departs from that, and a thumb anywhere."""
+    """Wide random poses. A hand closes by some amount, each finger departs from it, and the thumb may be anywhere."""
     low, high = LIMITS.to(rng.device).T
     pose = low + rng.uniform(len(POSE)) * (high - low)
     own = rng.uniform(1) ** 0.7  # how independent the fingers are
     close = torch.lerp(rng.uniform(1, low=-0.1), rng.uniform(4, low=-0.15), own)
-    split = 0.35 * (rng.uniform(1, low=-1) + rng.uniform(4, low=-0.5, high=0.5))  # more in the knuckles, or beyond
+    split = 0.35 * (rng.uniform(1, low=-1) + rng.uniform(4, low=-0.5, high=0.5))  # more in the knuckles, or more beyond
     pose[:, _MCP] = (close + split).clamp(-0.25, 1) * high[_MCP]
     pose[:, _PIP] = (close - split).clamp(-0.05, 1) * high[_PIP]
     spread = rng.uniform(1, low=-0.8, high=1.1) * pose.new_tensor([20, 0, 18, 36]) + rng.normal(4, std=5)
@@ -128,9 +128,10 @@ def _anything(rng: Random) -> Tensor:
 
 
 def sample_poses(rng: Random) -> Tensor:
-    """(B, P) radians, one pose for each stream of `rng`: within `LIMITS`, and with no part of the hand inside another.
+    """Poses (B, P) in radians, one for each stream of `rng`.
 
-    Three of four are gestures with jitter, one of four is a wide random pose.
+    They keep within `LIMITS`, and no part of the hand is inside another. Three of four are gestures, and one of four is
+    a wide random pose, all with jitter.
     """
     low, high = LIMITS.to(rng.device).T
     pose = torch.where(rng.chance(0.25, 1), _anything(rng), _gestures(rng))
@@ -139,7 +140,7 @@ def sample_poses(rng: Random) -> Tensor:
     noise[:, _ABDUCTION] += torch.deg2rad(rng.normal(1, std=2.5)) * pose.new_tensor([1.0, 0, 0.8, 1.6])
     pose = pose + noise
 
-    # A finger is drawn along by its neighbours; its last joint follows the middle one.
+    # A finger is drawn along by its neighbours. Its last joint follows the middle one.
     for joint, pull in ((_MCP, 0.07), (_PIP, 0.04)):
         bend = pose[:, joint]
         pulled = bend.clone()
@@ -153,7 +154,7 @@ def sample_poses(rng: Random) -> Tensor:
     arch = (0.55 * closed + 0.25 * (pose[:, INDEX['thumb_cmc_palmar'], None] / high[INDEX['thumb_cmc_palmar']]).clamp(0)
             + rng.normal(2, std=0.1)).clamp(0, 1)
     pose[:, INDEX['ring_cmc_flexion']:INDEX['pinky_cmc_flexion'] + 1] = arch * high[2:4]
-    # The wrist: bent back a little, more with a closed hand (tenodesis), less with an open one.
+    # The wrist is bent back a little, more with a closed hand (tenodesis) and less with an open one.
     bend = -10 + 22 * rng.normal() - 10 * (closed.mean(1) - 0.4)
     pose[:, 0], pose[:, 1] = torch.deg2rad(bend), torch.deg2rad(-5 + 10 * rng.normal())
     pose = torch.minimum(torch.maximum(pose, low), high)

@@ -1,11 +1,13 @@
 """Depth images of triangle meshes and of simple solids, in batches, in pure PyTorch (the same code on CPU and GPU).
 
-Everything here works on *nearness*, 1/z in 1/m with 0 = nothing. It is affine in the image over any plane, so a
-triangle is perspective-correct without a division per pixel; surfaces are composed with a maximum, whose result does
-not depend on the order; and "nothing" needs no special case. `depth_of` turns it into metres.
+Everything here works on *nearness*, which is 1/z in 1/m, 0 = nothing. `depth_of` turns it into metres. The reasons:
 
-A pixel's result is a function of its own sample only, by element-wise arithmetic: a sample is the same, bit for bit, in
-any batch.
+- Over any plane, it is affine in the image. So a triangle is perspective-correct without a division per pixel.
+- Surfaces are composed with a maximum, whose result does not depend on the order.
+- "Nothing" needs no special case.
+
+A pixel depends on its own sample only, and all arithmetic is element-wise. So a sample is the same, bit for bit, in any
+batch.
 """
 
 from __future__ import annotations
@@ -17,18 +19,18 @@ import torch
 from torch import Tensor
 
 NEAR = 0.05
-"""Triangles with a corner nearer than this (m) are not drawn: no depth sensor sees them."""
+"""Triangles with a corner nearer than this (m) are not drawn, because no depth sensor sees them."""
 
-_BLOCKS = (2, 4, 8)  # sizes in pixels of the square blocks that triangles are tested in; larger ones take several
-_INSIDE = -1e-4  # barycentric tolerance: neighbours overlap by a hair instead of leaving cracks
+_BLOCKS = (2, 4, 8)  # sides in pixels of the square blocks that triangles are tested in; larger triangles take several
+_INSIDE = -1e-4  # barycentric tolerance, so that neighbours overlap by a hair instead of leaving cracks
 
 
 @dataclass(frozen=True)
 class View:
-    """One pinhole window of `height` x `width` pixels for each sample: fx, fy, cx, cy are (B,) float32.
+    """One pinhole window of `height` x `width` pixels for each sample. fx, fy, cx and cy are (B,) float32.
 
-    (u, v) = (0, 0) is the first pixel of the window, so a window that starts at column c of a sensor has its cx lowered
-    by c.
+    (u, v) = (0, 0) is the first pixel of the window, so the cx of a window that starts at column c of a sensor is
+    lower by c.
     """
 
     fx: Tensor
@@ -70,7 +72,7 @@ def rasterise(vertices: Tensor, faces: Tensor, view: View) -> Tensor:
 
     Args:
         vertices: (B, V, 3) float32, metres, optical frame.
-        faces: (F, 3) int64; counter-clockwise seen from outside. Faces turned away are not drawn.
+        faces: (F, 3) int64, counter-clockwise seen from outside. Faces turned away are not drawn.
     """
     batch, height, width = len(vertices), view.height, view.width
     image = vertices.new_zeros(batch * height * width)
@@ -146,7 +148,7 @@ def ellipsoid(center: Tensor, axes: Tensor, radii: Tensor, view: View) -> Tensor
 
     Args:
         center: (B, 3) in metres.
-        axes: (B, 3, 3), its columns the directions of the three axes.
+        axes: (B, 3, 3), whose columns are the directions of the three axes.
         radii: (B, 3) along them, in metres.
     """
     x, y = view.rays
@@ -162,7 +164,7 @@ def ellipsoid(center: Tensor, axes: Tensor, radii: Tensor, view: View) -> Tensor
 
 
 def round_cone(start: Tensor, end: Tensor, start_radius: Tensor, end_radius: Tensor, view: View) -> Tensor:
-    """Nearness (B, H, W) of all spheres between two spheres: a capsule where the radii are equal.
+    """Nearness (B, H, W) of all spheres between two spheres. Where the radii are equal, this is a capsule.
 
     Args:
         start, end: (B, 3) centres in metres.
@@ -207,7 +209,7 @@ def box(center: Tensor, axes: Tensor, half: Tensor, view: View) -> Tensor:
 
     Args:
         center: (B, 3) in metres.
-        axes: (B, 3, 3), its columns the directions of the edges.
+        axes: (B, 3, 3), whose columns are the directions of the edges.
         half: (B, 3) half lengths of the edges, in metres.
     """
     x, y = view.rays

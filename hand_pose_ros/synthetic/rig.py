@@ -74,8 +74,9 @@ def _read(path: Path) -> tuple[Array, NDArray[np.int64], Array, dict[str, Array]
             shares.append(share / share.sum(1, keepdims=True))
             first += len(points[-1])
     except (KeyError, IndexError, TypeError, ValueError, StopIteration) as error:
-        raise InputError(f'cannot use {path} as a hand rig: part {error} is missing or damaged in it') from error
-    # Vertices are doubled along the seams of the texture: join them, so that the skin is closed.
+        raise InputError(f'cannot use {path} as a hand rig: a part of it is missing or damaged '
+                         f'({error!r}); give a .glb of a skinned hand') from error
+    # Vertices are doubled along the seams of the texture. They are joined, so that the skin is closed.
     _, kept, index = np.unique(np.concatenate(points).round(7), axis=0, return_index=True, return_inverse=True)
     faces = index.reshape(-1)[np.concatenate(triangles)]
     faces = faces[(faces != np.roll(faces, 1, 1)).all(1)]
@@ -84,14 +85,14 @@ def _read(path: Path) -> tuple[Array, NDArray[np.int64], Array, dict[str, Array]
 
 def _turned(path: Path, vertices: Array, faces: Array,
             joints: dict[str, Array]) -> tuple[Array, Array, dict[str, Array]]:
-    """The same as a right hand in the hand frame, and with the axes of `kinematics`."""
+    """Vertices, faces and joints as those of a right hand in the hand frame, with the axes of `kinematics`."""
     missing = [name for name in ('wrist', *chain.from_iterable(_CHAINS.values())) if name not in joints]
     if missing:
         raise InputError(f'{path} lacks the WebXR hand joints {", ".join(missing)}: rename the bones of the rig')
     wrist, index, middle, pinky = (
         joints[name][:3, 3] for name in ('wrist', *(_CHAINS[finger][0] for finger in ('index', 'middle', 'pinky'))))
     frame = _axes_along(middle - wrist, index - pinky).T
-    if -joints['wrist'][:3, 1] @ frame[2] < 0:  # the palm lies on the other side: a left hand
+    if -joints['wrist'][:3, 1] @ frame[2] < 0:  # the palm lies on the other side, so this is a left hand
         frame[2] *= -1
         faces = faces[:, ::-1]
     turned = {}
@@ -112,7 +113,7 @@ def _axes_along(direction: Array, across: Array) -> Array:
 
 
 def _measure(path: Path, points: Array, shares: Array, heads: Array, rotations: Array) -> Shape:
-    """The measures of the rig at rest: from its joints (5, 4, 3), and from the skin for what those do not say."""
+    """The measures of the rig at rest, from its joints (5, 4, 3), and from its skin where the joints do not tell."""
     radii, ends, lengths = np.zeros((5, 3)), np.zeros(5), np.linalg.norm(np.diff(heads, axis=1), axis=2)
     for digit in range(5):
         for i in range(3):
@@ -138,11 +139,12 @@ def _tensor(array: Any) -> torch.Tensor:
 
 
 class Rig(SkinnedHand):
-    """A hand from a glTF file, driven by the same shapes and poses as `HandModel`; it has no forearm of its own.
+    """A hand from a glTF file, driven by the same shapes and poses as `HandModel`. It has no forearm of its own.
 
     The bones are scaled to the measures of the shape that is asked for (`shape` holds the measures of the rig itself).
-    Joints are the origins of the rig's bones, scaled likewise, but for the tips: those of WebXR lie at no fixed depth,
-    so ours are put one fingertip radius inside the end of the skin, as hand21 wants them. A left hand is mirrored.
+    The joints are the origins of the bones of the rig, scaled likewise, except for the tips. The tips of WebXR lie at
+    no fixed depth, so ours are put one fingertip radius inside the end of the skin, as hand21 wants them. A left hand
+    is mirrored.
 
     Args:
         path: a .glb file with one skin whose joints have the names and the axes of WebXR (-z along the bone, -y out of
@@ -160,7 +162,7 @@ class Rig(SkinnedHand):
         points, faces, joints = _turned(path, vertices, faces, joints)
         heads = np.array([[joints[name][:, 3] for name in names] for names in _CHAINS.values()])
 
-        # The bones of ours that carry what each joint of the rig carries, and their axes.
+        # For each joint of the rig, the bone of ours that carries the same skin. Then the axes of these bones.
         owner = {name: DIGIT[digit] + 2 * min(i, 2) + 1
                  for digit, names in enumerate(_CHAINS.values()) for i, name in enumerate(names)}
         owner |= {f'{finger}-finger-metacarpal': METACARPAL[digit] for digit, finger in enumerate(FINGERS) if digit}

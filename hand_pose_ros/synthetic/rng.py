@@ -48,7 +48,7 @@ class Random:
         return self._key.device
 
     def fork(self, stream: int) -> Random:
-        """Independent streams for another purpose: what one part draws does not shift what another part gets."""
+        """Independent streams for another purpose, so that draws of one part do not shift those of another part."""
         child = object.__new__(Random)
         child._key = _mix(self._key ^ _signed32(0x9E3779B9 * (stream + 1)))
         child._calls = 0

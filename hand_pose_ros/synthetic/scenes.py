@@ -22,16 +22,17 @@ from hand_pose_ros.synthetic.sensors import sensor_table
 VIEWS = {'frontal': 0.44, 'egocentric': 0.16, 'overhead': 0.12, 'side': 0.12, 'any': 0.16}
 """Shares of the ways in which a camera looks at a hand."""
 
-# For each of VIEWS: where the fingers point, where the palm faces, and the spread about it in radians (out of the image
-# plane, within it). Frontal: held up to a camera opposite; egocentric: from one's own head; overhead: over a table.
+# For each of VIEWS, _BASES tells where the fingers point and where the palm faces. _SCATTER is the spread about that in
+# radians, out of the image plane and within it. A frontal hand is held up to a camera opposite. An egocentric one is
+# seen from one's own head, and an overhead one from above a table.
 _BASES = torch.tensor([[[0, -1, 0], [0, 0, -1]], [[0, -0.8, 0.6], [0, 0.6, 0.8]], [[0, -1, 0], [0, 0, 1]],
                        [[0, -1, 0], [1, 0, 0]], [[0, -1, 0], [0, 0, -1]]], dtype=torch.float32)
 _SCATTER = torch.tensor([[0.45, 0.7], [0.5, 0.7], [0.4, 3.0], [0.5, 1.0], [3.0, 3.0]])
-_LEAN = torch.tensor([0.35, 0.0, 0.0, 0.25, 0.0])  # radians: a hand held out to the camera is nearer than its elbow
-_TURNED = torch.tensor([0.3, 0.4, 0.25, 0.5, 0.5])  # chance of the other face of the hand
+_LEAN = torch.tensor([0.35, 0.0, 0.0, 0.25, 0.0])  # radians, as a hand held out to the camera is nearer than its elbow
+_TURNED = torch.tensor([0.3, 0.4, 0.25, 0.5, 0.5])  # chance to see the other face of the hand
 _HALF_HAND = 0.10  # m
 _ARM_NEAR = 0.12  # a forearm that comes this close to the camera, in metres, would come out of it
-_ARM_HIDES = 0.8  # cosine between the fingers and the line of sight beyond which one sees mostly an elbow
+_ARM_HIDES = 0.8  # cosine between fingers and line of sight; beyond it, one sees mostly an elbow
 
 
 @dataclass
@@ -39,10 +40,10 @@ class Solid:
     """One kind of solid, in some samples of a batch.
 
     Attributes:
-        draw: of `renderer`; its arguments are the measures and a view.
-        samples: (K,) that contain it.
-        measures: each (K, ...).
-        balls, radii: (K, N, 3), (K, N) of N balls, whose hull holds it; None where there is no end to it.
+        draw: function of `renderer`. Its arguments are the measures and a view.
+        samples: (K,) indices of the samples that contain it.
+        measures: arguments of `draw`, each (K, ...).
+        balls, radii: centres (K, N, 3) and radii (K, N) of N balls whose hull contains it. None if it has no end.
     """
 
     draw: Callable[..., Tensor]
@@ -52,7 +53,7 @@ class Solid:
     radii: Tensor | None = None
 
     def within(self, view: View, back: Tensor) -> Solid:
-        """Those of it that may be seen in the `view` before the distance `back` (B,)."""
+        """The same solid, in only those samples where it may be seen in the `view`, nearer than `back` (B,) metres."""
         if self.balls is None or self.radii is None:
             return self
         view, back = view[self.samples], back[self.samples]
@@ -61,14 +62,15 @@ class Solid:
         reach = torch.maximum(view.fx, view.fy)[:, None] * self.radii * 1.5 / nearest.clamp(min=0.05)
         beside = torch.stack([u < -reach, u > view.width + reach, v < -reach, v > view.height + reach,
                               nearest > back[:, None]])
-        # Beside the window on one side with all its balls. (Those near the camera's plane project anywhere.)
+        # It cannot be seen if all its balls are beyond the same side of the window, or beyond `back`. Balls near the
+        # plane of the camera project anywhere, so they count as seen.
         seen = (~beside.all(2).any(0) | (nearest < 0.05).any(1)).nonzero()[:, 0]
         return Solid(self.draw, self.samples[seen], tuple(m[seen] for m in self.measures))
 
 
 @dataclass
 class Others:
-    """Second hands: their skin (K, V, 3), the samples (K,) they are in, and which of them are left hands (K,)."""
+    """Second hands, with their skin (K, V, 3), the samples (K,) they are in, and which of them are left hands (K,)."""
 
     vertices: Tensor
     samples: Tensor
@@ -82,8 +84,9 @@ class Scene:
     Attributes:
         vertices, joints: (B, V, 3) and (B, 21, 3) of the right hand.
         present: (B,) bool, whether there is a hand at all.
-        soft: things with folds and relief (bodies, walls); hard: objects.
-        others: second hands.
+        soft: things with folds and relief (bodies, walls).
+        hard: objects.
+        others: second hands, if there are any.
     """
 
     vertices: Tensor
@@ -156,12 +159,15 @@ def sample_views(rng: Random, only: str | None = None) -> tuple[Tensor, Tensor]:
 
 
 def sample_positions(rng: Random, sensor: Tensor) -> Tensor:
-    """(B, 3) where hands are: at the sensor's distances, mostly well inside its image, some across its border."""
+    """Positions (B, 3) of hands in metres, at the distances of their sensors.
+
+    Most are well inside the image, and some across its border.
+    """
     table = lambda name: sensor_table(name, sensor.device)[sensor]  # noqa: E731
     near, far = table('hand_distance').unbind(1)
     z = near + (far - near) * rng.uniform()
     size, focal = torch.stack([table('width'), table('height')], 1), torch.stack([table('fx'), table('fy')], 1)
-    whole = (size / 2 - _HALF_HAND * focal / z[:, None]).clamp(min=0)  # as far from the middle a hand is not cut off
+    whole = (size / 2 - _HALF_HAND * focal / z[:, None]).clamp(min=0)  # a hand this far from the middle is not cut off
     middling = torch.maximum(torch.minimum(rng.normal(2) * 0.16 * size, whole), -whole)
     u, v = torch.where(rng.chance(0.12)[:, None], rng.uniform(2, low=-0.5, high=0.5) * size, middling).unbind(1)
     u, v = u + (table('width') / 2 - table('cx')), v + (table('height') / 2 - table('cy'))
@@ -169,13 +175,16 @@ def sample_positions(rng: Random, sensor: Tensor) -> Tensor:
 
 
 def place(vertices: Tensor, joints: Tensor, rotation: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
-    """Hands from the hand frame into the camera's, the mean of their joints at `position` (B, 3)."""
+    """Hands moved from the hand frame to the optical frame, with the mean of their joints at `position` (B, 3)."""
     middle = joints.mean(1, keepdim=True)
     return (turn(rotation, vertices - middle) + position[:, None], turn(rotation, joints - middle) + position[:, None])
 
 
 def keep_arm_off_camera(rotation: Tensor, position: Tensor) -> Tensor:
-    """Rotations with the hand turned about its x axis where its forearm would hide it or run into the camera."""
+    """Rotations (B, 3, 3) that keep forearms from hiding their hands and from running into the camera.
+
+    Where a forearm would, the hand is turned by half a turn about the x axis of the camera.
+    """
     away = rotation[:, 2, 1]  # how much the fingers point away from the camera
     flipped = torch.stack([rotation[:, 0], -rotation[:, 1], -rotation[:, 2]], 1)
     bad = (away > _ARM_HIDES) | (position[:, 2] - 0.30 * away < _ARM_NEAR)
@@ -186,7 +195,7 @@ def draw_solids(scene: Scene, view: View, back: Tensor | None = None, relief: Te
     """Nearness (B, H, W) of everything but hands.
 
     Args:
-        back: (B,) metres; what lies wholly behind it may be left out.
+        back: (B,) metres. What lies wholly behind it may be left out.
         relief: (B, H, W) metres, laid over what is soft.
     """
     image = torch.zeros(len(scene.present), view.height, view.width, device=scene.joints.device)
@@ -217,7 +226,7 @@ def draw_hands(scene: Scene, faces: Tensor, view: View) -> tuple[Tensor, Tensor]
 
 
 def draw_sticks(scene: Scene, elbow: Tensor | None, view: View) -> Tensor:
-    """Nearness (B, H, W) of hands made of sticks: what remains of a hand without its surface."""
+    """Nearness (B, H, W) of hands made of sticks, which remain of a hand without its surface."""
     image = torch.zeros(len(scene.present), view.height, view.width, device=scene.joints.device)
     there = scene.present.nonzero()[:, 0]
     joints, view = scene.joints[there], view[there]
@@ -233,7 +242,10 @@ def draw_sticks(scene: Scene, elbow: Tensor | None, view: View) -> Tensor:
 
 
 def splat(points: Tensor, view: View) -> Tensor:
-    """Nearness (B, H, W) of points (B, N, 3), one pixel each: a coarse image of a dense mesh at a tenth of the cost."""
+    """Nearness (B, H, W) of points (B, N, 3), one pixel each.
+
+    For a dense mesh, this is a coarse image at a tenth of the cost.
+    """
     u, v = view.project(points)
     column, row = u.round().long(), v.round().long()
     seen = (column >= 0) & (column < view.width) & (row >= 0) & (row < view.height) & (points[..., 2] > renderer.NEAR)
@@ -244,6 +256,6 @@ def splat(points: Tensor, view: View) -> Tensor:
 
 
 def smooth_relief(rng: Random, view: View, cells: int = 10) -> Tensor:
-    """(B, H, W) metres: folds of cloth and unevenness, up to some millimetres."""
+    """Folds of cloth and unevenness (B, H, W) in metres, up to some millimetres."""
     grid = rng.normal(1, cells, cells) * (rng.uniform(1, 1, 1) * 0.004)
     return functional.interpolate(grid, (view.height, view.width), mode='bilinear')[:, 0]

@@ -27,9 +27,9 @@ class Sensor:
         family: key of `FAMILIES`.
         hand_distance: nearest and farthest distance of a hand that it is used for, m.
         near, far: nearest and farthest reading, m.
-        noise: standard deviation; of the disparity in pixels, or for time of flight as a factor on Fankhauser's model.
+        noise: standard deviation of the disparity, px; for time of flight, a factor on Fankhauser's model.
         baseline: from camera to projector or second camera along +x, m.
-        step: quantum of the disparity, px.
+        step: step to which the disparity is rounded, px.
         unit: metres per unit of its images.
         smoothing: share of an edge-preserving 3x3 mean in the output (the filters that its driver runs).
     """
@@ -64,7 +64,7 @@ SENSORS = (
     Sensor('d415', 'active_stereo', Intrinsics(606.0, 606.0, 320, 240, 640, 480), (0.4, 1.1), 0.3, 6.0,
            noise=0.08, baseline=0.055, step=1 / 32, smoothing=0.5),
 )
-"""Intrinsics are typical factory values; a hand may be anywhere in `hand_distance`."""
+"""Intrinsics are typical factory values. A hand may be anywhere in `hand_distance`."""
 
 
 def get_sensor(name: str) -> int:
@@ -81,7 +81,7 @@ def get_sensor(name: str) -> int:
 
 @cache
 def sensor_table(field: str, device: torch.device) -> Tensor:
-    """One property of all SENSORS as a (S,) or (S, 2) tensor; intrinsics by their own names (fx, width ...)."""
+    """One property of all SENSORS as a (S,) or (S, 2) tensor. Intrinsics have their own names (fx, width ...)."""
     return torch.tensor([getattr(s if hasattr(s, field) else s.intrinsics, field) for s in SENSORS],
                         dtype=torch.float32, device=device)
 
@@ -94,7 +94,7 @@ FAMILIES: dict[str, tuple[Callable[[Tensor, Shot], Tensor], ...]] = {
     'active_stereo': (effects.shadow, effects.fattening, effects.jitter, effects.grazing_holes,
                       effects.disparity_noise, effects.smoothing, effects.dark_spots),
 }
-"""What happens to the light, in this order."""
+"""The effects of each family, in the order in which they happen."""
 
 
 def sense(nearness: Tensor, seeds: Tensor, sensor: Tensor, focal: Tensor, mirrored: Tensor, frame: int = 0) -> Tensor:
@@ -102,11 +102,11 @@ def sense(nearness: Tensor, seeds: Tensor, sensor: Tensor, focal: Tensor, mirror
 
     Args:
         nearness: (B, H, W), 1/z in 1/m.
-        seeds: (B,) of the noise and of all that is lasting about camera and scene.
+        seeds: (B,) of the noise, and of what stays while a camera looks at a scene.
         sensor: (B,) indices in SENSORS.
-        focal: (B,) focal length of these images, px; lower than the sensor's where they were thinned out.
-        mirrored: (B,) bool, whether the images are to be mirrored afterwards.
-        frame: number of these images among others that show the same.
+        focal: (B,) focal length of these images, px. It is lower than that of the sensor where they were thinned out.
+        mirrored: (B,) bool, whether the images are mirrored afterwards.
+        frame: number of these images in a sequence, where each image has its own noise.
 
     Returns:
         (B, H, W) depth in metres, 0 = no reading.

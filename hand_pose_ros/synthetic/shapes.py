@@ -1,8 +1,11 @@
 """How hands differ: lengths, breadths and thicknesses drawn from published anthropometry.
 
-Sources: hand length and breadth from the ACOPLA95 survey; joint centres as fractions of hand length and breadth from
-Buchholz et al. 1992, An et al. 1979 and Sancho-Bru et al. 2011; bones of 66 adults by Buryanov and Kotiuk 2010, which
-shortens thumb, index and little finger of the former a little.
+Sources:
+
+- the ACOPLA95 survey for the length and breadth of hands
+- Buchholz et al. 1992, An et al. 1979 and Sancho-Bru et al. 2011 for joint centres as fractions of length and breadth
+- Buryanov and Kotiuk 2010 for the bones of 66 adults, with which thumb, index and little finger are a little shorter
+  than with the former
 """
 
 from __future__ import annotations
@@ -18,8 +21,8 @@ MEN, WOMEN = (0.183, 0.084), (0.166, 0.075)
 """Mean hand length and breadth in metres."""
 
 FINGER_END = 0.92
-"""How far a finger goes on past its tip joint, over the half thickness of its last bone: the joint is the centre of
-the pulp, about one fingertip radius inside the end."""
+"""How far a finger goes on past its tip joint, over the half thickness of its last bone. The joint is the centre of the
+pulp, about one fingertip radius inside the end."""
 
 # Bones along each digit over hand length, to the end of the finger. Thumb: metacarpal, proximal, distal.
 _SEGMENTS = ((0.245, 0.181, 0.153), (0.251, 0.138, 0.112), (0.272, 0.163, 0.119), (0.253, 0.156, 0.117),
@@ -39,8 +42,8 @@ class Shape:
         hand_length: (B,) wrist to the end of the middle finger.
         hand_breadth: (B,) across the knuckles, with the flesh.
         roots: (B, 5, 3) first joint of each digit in the flat hand: thumb CMC, then four MCP.
-        segments: (B, 5, 3) bones along each digit, root to tip joint: thumb metacarpal, proximal, distal; the others
-            proximal, middle, distal.
+        segments: (B, 5, 3) bones along each digit, from root to tip joint. Those of the thumb are metacarpal, proximal
+            and distal, and those of the others are proximal, middle and distal.
         radii: (B, 5, 3) half thickness of the flesh around the segments.
         palm_depth: (B,) half thickness of the palm at the knuckles.
         wrist: (B, 2) half breadth and half depth of the wrist.
@@ -90,7 +93,7 @@ def make_shape(length: Tensor, breadth: Tensor, bone_scale: Tensor | None = None
     radii = ones.new_tensor(_RADII) * breadth[:, None, None] / 2 * (ones if flesh is None else flesh)
     girth = ones[:, 0, :1].expand(-1, 4) if girth is None else girth
 
-    factor = length / (roots[:, 2, 1] + to_end[:, 2].sum(-1))  # keeps the length of the hand what it is called
+    factor = length / (roots[:, 2, 1] + to_end[:, 2].sum(-1))  # makes the hand as long as `length`
     roots = torch.cat([roots[..., :1], roots[..., 1:2] * factor[:, None, None], roots[..., 2:]], -1)
     segments = to_end * factor[:, None, None]
     segments = torch.cat([segments[..., :2], (segments[..., 2] - _finger_end(radii))[..., None]], -1)
@@ -110,9 +113,9 @@ def mean_shape(sex: str = 'both') -> Shape:
 def sample_shapes(rng: Random) -> Shape:
     """One hand for each stream of `rng`: 45 % men, 40 % women, 15 % children of about five to fourteen years.
 
-    Length and breadth of the hand are correlated (0.6 within a sex). Every segment departs from its proportion by
-    about 5.5 %: shared along a finger, shared across the fingers, and its own, in equal parts. Flesh: 5 % common, 2 %
-    its own.
+    Length and breadth of the hand are correlated, with 0.6 within a sex and 0.9 among children. Every segment departs
+    from its proportion by about 5.5 %. Of this, equal parts are shared along a digit, shared across the digits, and its
+    own. The flesh varies by 5 % for the whole hand, by 1.5 % for each digit and by 2 % for each segment.
     """
     kind = rng.choice(torch.tensor([0.45, 0.40, 0.15]))
     mean = torch.tensor([MEN, WOMEN, (0.147, 0.067)], device=rng.device)[kind]

@@ -21,14 +21,14 @@ from hand_pose_ros.synthetic.sensors import sensor_table
 from hand_pose_ros.synthetic.shapes import Shape, sample_shapes
 
 CUBE_SIDE = 0.30
-"""Of the product's detector, metres."""
+"""Side of the cube of the product's detector, metres."""
 WINDOW = 144
-"""Pixels across the window that is drawn for a patch: the patch and a margin for effects that look sideways."""
+"""Pixels across the window that is drawn for a patch, with a margin for effects that look sideways."""
 
 _COARSE, _COARSE_SIDE = 64, 0.64  # pixels and metres across the image in which the detector's rule runs
-_NEAREST = 24  # of its pixels (1 cm2 each) make the first guess: something from a finger to a hand
+_NEAREST = 24  # so many of its pixels (1 cm2 each) make the first guess, from a finger to a hand
 _NEGATIVES = 0.05  # share of samples without a hand
-_FOREARM = 6  # as a part of the skin
+_FOREARM = 6  # number of this part of the skin
 _SECOND_HAND = 0.08  # share of samples with another hand nearby
 
 # Streams of random numbers.
@@ -37,7 +37,7 @@ _SHAPE, _POSE, _VIEW, _CAMERA, _FURNITURE, _SECOND, CROP, _MOTION, _PAST, WINDOW
 
 @dataclass(frozen=True)
 class Ingredients:
-    """What makes the hands real; switch one off to learn what it is worth.
+    """What makes the hands real. Switch one off to learn what it is worth.
 
     Attributes:
         surface: skin; without it, sticks and balls.
@@ -58,12 +58,13 @@ class Ingredients:
 
 @dataclass
 class Motion:
-    """How hands depart from their sample: one row, or several to move between.
+    """How hands depart from those of their sample. There is one row, or several to move between.
 
     Attributes:
-        pose: (N, P) radians.
+        pose: (N, P) radians. It replaces the pose of the sample.
         turn: (N, 3) radians, about the three axes of the camera.
-        shift: (N, 3) metres; nearer: (N, 1) factor on the position.
+        shift: (N, 3) metres, added to the position.
+        nearer: (N, 1) factor on the position, before the shift.
     """
 
     pose: Tensor
@@ -73,7 +74,7 @@ class Motion:
 
     @staticmethod
     def draw(seed: Tensor, number: int) -> Motion:
-        """That many places to go to, for one seed (1,)."""
+        """`number` random rows to move between, for one seed (1,)."""
         rng = Random(seed).fork(_MOTION)
         high, low = (rng.uniform(2, number)[0] * 2 ** 24).long()
         return Motion(sample_poses(Random(high << 24 | low)), rng.normal(number, 3, std=0.25)[0],
@@ -88,7 +89,7 @@ class Motion:
 
 @dataclass
 class Stage:
-    """Scenes with the cameras that see them; all for right hands, to be mirrored where `mirrored`."""
+    """Scenes with the cameras that see them. All are made for right hands, and are to be mirrored where `mirrored`."""
 
     seeds: Tensor
     scene: Scene
@@ -98,7 +99,7 @@ class Stage:
     elbow: Tensor
 
     def camera(self, scale: Tensor | float = 1.0) -> tuple[Tensor, ...]:
-        """fx, fy, cx, cy, width and height (B,) of the sensors with `scale` times their pixels."""
+        """fx, fy, cx, cy, width and height (B,) of the sensors, with `scale` times their pixels along each side."""
         fx, fy, cx, cy, width, height = (sensor_table(name, self.sensor.device)[self.sensor]
                                          for name in ('fx', 'fy', 'cx', 'cy', 'width', 'height'))
         cx = torch.where(self.mirrored, width - 1 - cx, cx)
@@ -106,9 +107,10 @@ class Stage:
                 (width * scale).round(), (height * scale).round())
 
     def window(self, center: Tensor, side: Tensor) -> tuple[View, Tensor]:
-        """The pixels of the sensor that the crop can see, and which of them (B, H, W) lie in its image.
+        """The pixels of the sensor that the crop can see, and which of them (B, H, W) lie in the image of the sensor.
 
-        A sensor finer than the patch is thinned out to the patch's grid: nearest-neighbour cropping does that anyway.
+        A sensor that is finer than the patch is thinned out to the grid of the patch, because nearest-neighbour
+        cropping does that anyway.
         """
         fx, fy, cx, cy, *_ = self.camera()
         scale = (PATCH_SIZE * center[:, 2] / side / torch.maximum(fx, fy)).clamp(max=1)
@@ -143,7 +145,7 @@ class _Armed(nn.Module):
 
 
 class Stages:
-    """Makes stages; see `SyntheticHands` for the arguments. `sensors`: indices in SENSORS to draw from."""
+    """Makes stages. See `SyntheticHands` for the arguments, but `sensors` are indices in SENSORS to draw from."""
 
     def __init__(self, ingredients: Ingredients, sensors: Tensor, hand: SkinnedHand, device: torch.device) -> None:
         self.ingredients = ingredients
@@ -157,7 +159,11 @@ class Stages:
         self._elbow = forearm[rest[0, forearm, 1].argsort()[:8]]
 
     def build(self, seeds: Tensor, motion: Motion | None = None, around: Scene | None = None) -> Stage:
-        """The scenes of these seeds (B,); with `motion`, hands held up to the camera in rooms made `around` others."""
+        """The scenes of these seeds (B,).
+
+        With `motion`, all hands are held up to the camera and depart from their sample by it. What else there is then
+        fits the hands of the scene `around`.
+        """
         rng = Random(seeds)
         pose = self._poses(rng.fork(_POSE)) if motion is None else motion.pose
         vertices, joints = self._hand(sample_shapes(rng.fork(_SHAPE)), pose)
@@ -192,7 +198,7 @@ class Stages:
         if len(chosen) == 0:
             return
         rng = Random(stage.seeds[chosen]).fork(_SECOND)
-        rng = rng.fork(0)  # not the number that chose them
+        rng = rng.fork(0)  # so that the number that chose them is not drawn again
         rotation, _ = scenes.sample_views(rng.fork(0))
         left = rng.chance(0.7)
         angle = 2 * math.pi * rng.uniform()
@@ -207,15 +213,16 @@ class Stages:
         stage.scene.others = scenes.Others(placed, chosen, left)
 
     def middles(self, vertices: Tensor) -> Tensor:
-        """(B, 3), about where the joints of hands with this skin (B, V, 3) have their mean."""
+        """The mean (B, 3) of this skin (B, V, 3) without the forearm, which is about the mean of the joints."""
         return vertices[:, self._hand.vertex_part != _FOREARM].mean(1)
 
     def detect(self, stage: Stage, elsewhere: Tensor) -> Tensor:
         """Where the product's detector settles, (B, 3) in metres, found in a coarse image around the hand.
 
         Args:
-            elsewhere: (B,) bool, look past the hand, as the detector does once an object was judged: at the arm, or,
-                behind a random distance, at the body or what else is there.
+            elsewhere: (B,) bool, look past the hand, as the detector does after it has judged an object. Then what is
+                near the hand is left out, which leaves the arm. In half of these, all that is nearer than a random
+                distance behind the hand is left out, too, which leaves the body or what else is there.
         """
         x, y, z = stage.position.unbind(1)
         focal = _COARSE / _COARSE_SIDE * z

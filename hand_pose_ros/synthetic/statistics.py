@@ -1,4 +1,4 @@
-"""How patches of synthetic and of real hands compare: a few numbers that a network could tell them apart by."""
+"""Compares patches of synthetic and of real hands by a few numbers, by which a network could tell them apart."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ def describe(patch: NDArray[np.float32], side: float) -> dict[str, float]:
 
     Returns:
         covered: share of the patch that shows something.
-        missing: share without a reading of what would be covered if small gaps were closed.
-        edge noise: how much longer the outline is than that of the same shape smoothed (0 = as smooth).
+        missing: of what is covered once small gaps are closed, the share without a reading.
+        edge noise: how much longer the outline is than that of the smoothed shape, as a share (0 = as smooth).
         noise mm: mean difference of a pixel inside the surface from the median of its 3x3 pixels.
-        extent mm: along the main axis of what is shown, from the 2nd to the 98th percentile.
+        extent mm: of what is shown, along its main axis, from the 2nd to the 98th percentile.
         steps ...: shares of the steps between horizontal neighbours, by size in mm.
     """
     shown = patch < 1
@@ -68,7 +68,7 @@ def _extent(points: NDArray[np.floating]) -> float:
 
 
 def summarise(patches: Iterable[tuple[NDArray[np.float32], float]]) -> dict[str, tuple[float, float, float]]:
-    """Quartiles over patches with the sides of their cubes.
+    """Quartiles of each number of `describe`, over patches with the sides of their cubes.
 
     Raises:
         InputError: there are no patches.
@@ -82,11 +82,14 @@ def summarise(patches: Iterable[tuple[NDArray[np.float32], float]]) -> dict[str,
 
 def real_patches(folder: Path, intrinsics: Sequence[float], depth_scale: float,
                  side: float = 0.30) -> list[tuple[NDArray[np.float32], float]]:
-    """The crops that the product makes of the 16-bit depth PNGs in a folder; images without a hand are left out.
+    """The crops that the product makes of the 16-bit depth PNGs in a folder, and the sides of their cubes in metres.
+
+    Images without a hand are left out.
 
     Args:
         intrinsics: fx, fy, cx, cy in pixels.
         depth_scale: metres per unit.
+        side: side of the cubes, metres.
 
     Raises:
         InputError: the folder has no PNG, or one cannot be read.

@@ -1,8 +1,8 @@
 """The skin of the average hand at rest, as one seamless mesh that knows which bones carry it.
 
-The hand is modelled the way a sculptor in clay would: tapered rolls and pads around the bones, smoothed into each other
-(a signed distance), and a mesh is then read off it. Nothing is loaded: measures come from `shapes`, so the surface is
-as free as the numbers in it.
+The hand is modelled as in clay. Tapered rolls and pads around the bones are smoothed into each other, which gives a
+signed distance, and a mesh is read off it. Nothing is loaded. The measures come from `shapes`, so the surface is as
+free to use as those numbers.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class RestHand:
-    """The average hand at rest: bone frames and measures, in metres (see `kinematics.forward`)."""
+    """The bone frames (see `kinematics.forward`) and measures of the average hand at rest, in metres."""
 
     rotations: Array  # (K, 3, 3)
     origins: Array    # (K, 3)
@@ -40,14 +40,14 @@ class RestHand:
 
 
 def _blend(a: Array, b: Array, width: float) -> Array:
-    """Smooth union of two distances (quadratic polynomial minimum): a fillet of about `width`."""
+    """Smooth union of two distances (quadratic polynomial minimum), with a fillet of about `width`."""
     h = np.clip(width - np.abs(a - b), 0, None) / width
     return np.minimum(a, b) - h * h * width / 4
 
 
 def _roll(p: Array, a: tuple[float, float, float], b: tuple[float, float, float], ra: float, rb: float,
           flat: float = 1.0) -> Array:
-    """A tapered roll of clay from a to b; `flat` < 1 flattens it along z."""
+    """Distance to a tapered roll of clay from a to b. `flat` < 1 flattens it along z."""
     start, end = np.array(a), np.array(b)
     along = end - start
     offset = p - start
@@ -58,7 +58,7 @@ def _roll(p: Array, a: tuple[float, float, float], b: tuple[float, float, float]
 
 
 def _pad(p: Array, center: tuple[float, float, float], radii: tuple[float, float, float]) -> Array:
-    """An ellipsoid (distance exact to first order at the surface)."""
+    """Distance to an ellipsoid, exact to first order at the surface."""
     q = (p - np.array(center)) / np.array(radii)
     k = np.linalg.norm(q, axis=1)
     g = np.linalg.norm(q / np.array(radii), axis=1)
@@ -66,7 +66,7 @@ def _pad(p: Array, center: tuple[float, float, float], radii: tuple[float, float
 
 
 def _sheet(p: Array, a: Array, b: Array, c: Array, radius: float) -> Array:
-    """A thick triangle."""
+    """Distance to a thick triangle."""
     ab, ac = b - a, c - a
     normal = np.cross(ab, ac)
     normal /= np.linalg.norm(normal)
@@ -153,7 +153,7 @@ def _thumb_root(rest: RestHand, p: Array) -> tuple[Array, Array]:
 
 
 def _forearm(rest: RestHand, p: Array) -> Array:
-    """Distance to wrist and forearm: an oval that widens to a round, cut at the elbow."""
+    """Distance to wrist and forearm, an oval that gets wider and rounder towards the elbow, where it is cut."""
     q = rest.local(p, 0)
     t = np.clip(-q[:, 1] / rest.forearm[0], -0.2, 1)
     grow = np.clip(t / 0.72, 0, 1)
@@ -200,15 +200,18 @@ def _ramp(x: Array, low: float, high: float) -> Array:
 
 
 def _share(s: Array, reach: float, back: float) -> tuple[Array, Array, Array]:
-    """Weights of (before, at, after) a joint at distance s along the bone past it, blending from -back to reach."""
+    """Weights of what is before, at and after a joint, for points at distance s past it along the bone.
+
+    They blend from -back to reach.
+    """
     before, after = 1 - _ramp(s, -back, 0), _ramp(s, 0, reach)
     return before, 1 - before - after, after
 
 
 def _weights(rest: RestHand, p: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Weights (V, K) of the bones, rows adding to 1, and the part of each vertex: 0-4 digits, 5 palm, 6 forearm."""
+    """Weights (V, K) of the bones, with rows that add to 1, and the part of each vertex (V,), see `build`."""
     w = np.zeros((len(p), len(rest.origins)))
-    # Which digit (with its metacarpal) a vertex belongs to: sharp between fingers, gradual in the palm.
+    # The finger (with its metacarpal) that a vertex belongs to. This is sharp between fingers, and gradual in the palm.
     near = []
     for digit in range(1, 5):
         q = rest.local(p, METACARPAL[digit])

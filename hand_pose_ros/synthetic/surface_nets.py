@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 
 
 def surface_nets(grid: Array, value: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Zero set of `value` (nx, ny, nz) on lattice `grid` -> vertices (V, 3) and quads (Q, 4), outward."""
+    """Zero set of `value` (nx, ny, nz) on lattice `grid` -> vertices (V, 3) and quads (Q, 4) that face outwards."""
     shape = tuple(n - 1 for n in value.shape)
     total, count = np.zeros((*shape, 3)), np.zeros(shape)
     crossings = []
@@ -56,7 +56,7 @@ def surface_nets(grid: Array, value: Array) -> tuple[Array, NDArray[np.int64]]:
 
 
 def neighbour_mean(values: Array, quads: NDArray[np.int64]) -> Array:
-    """(V, ...) for each vertex the mean of `values` over its neighbours."""
+    """For each vertex, the mean of `values` (V, ...) over its neighbours."""
     total = np.zeros_like(values)
     for i in range(4):
         np.add.at(total, quads[:, i], values[quads[:, (i + 1) % 4]])

@@ -525,7 +525,7 @@ def test_other_damage_of_recorded_datasets_is_one_sentence(tmp_path):
     with pytest.raises(DatasetError, match='sequence 201403121135, which validates'):
         open_dataset('icvl', 'train', tmp_path / 'icvl')
     (tmp_path / 'icvl/labels.txt').write_bytes(gzip.compress(b'201403121135/image_0000.png'))
-    with pytest.raises(DatasetError, match='is not text; is it packed'):
+    with pytest.raises(DatasetError, match='is not text; unpack it if it is packed'):
         open_dataset('icvl', 'train', tmp_path / 'icvl')
     huge = tmp_path / 'icvl/Depth/test_seq_1/image_0000.png'
     header = b'IHDR' + struct.pack('>IIBBBBB', 65536, 32768, 16, 0, 0, 0, 0)

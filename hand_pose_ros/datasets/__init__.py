@@ -1,4 +1,4 @@
-"""Datasets of depth images with hand joints: one file each over one small base."""
+"""Datasets of depth images with hand joints. Each has its own file, over one small base."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ def open_dataset(name: str, split: str, root: Path | None = None, device: str = 
     """A dataset by name.
 
     Args:
-        name: one of `DATASETS`; 'msra:P3' leaves out the subject P3; 'synthetic:without-surface' trains on hands that
-            lack this ingredient (see `hand_pose_ros.synthetic.stages.Ingredients`), or with 'everything' all of them;
-            'scenes' are whole images of the same scenes, for `hand_finder`.
-        split: 'train', 'val' or 'test'; nyu and icvl also have 'test_1' and 'test_2'.
+        name: one of `DATASETS`. 'msra:P3' leaves out the subject P3. 'synthetic:without-surface' trains on hands that
+            lack this ingredient (see `hand_pose_ros.synthetic.stages.Ingredients`), and 'synthetic:without-everything'
+            on hands that lack all of them. 'scenes' are whole images of the same scenes, for `hand_finder`.
+        split: 'train', 'val' or 'test'. nyu and icvl also have 'test_1' and 'test_2'.
         root: folder of a recorded dataset.
         device: where synthetic hands are rendered.
 
     Raises:
-        DatasetError: no such dataset or split, or its files are missing.
+        DatasetError: there is no such dataset or split, or its files are missing.
     """
     kind, _, variant = name.partition(':')
     if kind not in DATASETS or (variant and kind not in ('msra', 'synthetic')):

@@ -1,4 +1,4 @@
-"""Bags with depth and, as labels, hand joints: your own recordings."""
+"""Your own recordings: bags with depth images, and with hand joints as labels."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ _Sample = tuple[Path, RecordedHands, int]
 
 
 class Bags(RecordedDataset):
-    """`root`/{train,val,test}/ with bags in each, so that no recording is in two splits.
+    """The bags in `root`/{train,val,test}/, so that no recording is in two splits.
 
-    Every hand of every HandJointsArray is a sample; its depth image is the one with the same stamp. Hands that lack a
-    joint are left out, and those whose side is unknown are taken for right hands; the log says how many.
+    Every hand of every HandJointsArray is a sample. Its depth image is the one with the same stamp. Hands that lack a
+    joint are left out, and hands whose side is unknown are taken for right hands. The log says how many.
     """
 
     skeleton: Skeleton
@@ -65,9 +65,12 @@ class Bags(RecordedDataset):
                              hands.sides[i] == 'left')
 
     def _image(self, bag: Path, stamp_ns: int) -> Frame:
-        """A bag is read in the order of recording, so samples in the order of their index cost one pass over it, and
-        another one wherever stamps are out of that order."""
-        attempts = [_images(bag)]  # which opens it only if it comes to that
+        """The depth image with this stamp.
+
+        A bag is read in the order of recording. So samples in the order of their index cost one pass over it, and
+        another one wherever stamps are not in the order of recording.
+        """
+        attempts = [_images(bag)]  # a generator, which opens the bag only when it is needed
         if self._reading and self._reading[0] == bag:
             _, images, last = self._reading
             if last.stamp_ns == stamp_ns:
@@ -92,8 +95,8 @@ def _read(bag: Path) -> list[_Sample]:
     tell_left_out(f'bags: {bag}', count - len(samples), count)
     sideless = sum(hands.sides[i] == 'unknown' for _, hands, i in samples)
     if sideless and multiprocessing.parent_process() is None:
-        log.warning('bags: %s: the side of %s of %s hands is unknown, and they are taken for right hands: write '
-                    'the side of those that are left ones', bag, sideless, len(samples))
+        log.warning('bags: %s: the side of %s of %s hands is unknown, so they are taken for right hands; write the '
+                    'side of those that are left hands', bag, sideless, len(samples))
     return samples
 
 
@@ -103,5 +106,5 @@ def _images(bag: Path) -> Iterator[Frame]:
 
 
 def _contents(bag: Path) -> bytes:
-    """Changes with the depth and the cameras in a bag."""
+    """Bytes that change with the depth and the cameras in a bag."""
     return require('bags', sorted(path for path in bag.rglob('*') if path.is_file()) if bag.is_dir() else [bag])

@@ -1,4 +1,4 @@
-"""What every dataset gives: crops of hands and their joints, whatever they were recorded or rendered with."""
+"""What every dataset gives, recorded or rendered: crops of hands, and their joints."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ Batch = dict[str, Tensor]
 
 - `patch` (B, 1, 128, 128) float, in [-1, 1]
 - `joints` (B, J, 3) float32, cube units
-- `cube_center` (B, 3) and `cube_side` (B,) float32, metres: `joints_in_metres` needs them. The centre of a mirrored
-  patch is mirrored too (x negated)
-- `hand_present` (B,) bool: false where the patch shows no hand; its joints mean nothing then
+- `cube_center` (B, 3) and `cube_side` (B,) float32, metres, for `joints_in_metres`. The centre of a mirrored patch is
+  mirrored too (x negated)
+- `hand_present` (B,) bool, false where the patch shows no hand. Its joints then mean nothing
 
-Training adds, after augmentation: `mirrored` (B,) bool, whether a patch was mirrored for the side to be learned, and
-`numbers` (B,) int64, seeds for what an objective draws. `SyntheticScenes` has other contents, and `shown`.
+Training adds two, after augmentation. `mirrored` (B,) bool tells whether a patch was mirrored for the side to be
+learned. `numbers` (B,) int64 are seeds for what an objective draws. `SyntheticScenes` has other contents, and `shown`.
 """
 
 
@@ -43,7 +43,7 @@ class DatasetError(HandPoseError):
 
 
 class Dataset(ABC):
-    """Samples by index; what a sample holds depends on its index and on nothing else."""
+    """Samples by index. What a sample holds depends on its index and on nothing else."""
 
     name: str
     """Tells this dataset and its part from others, for example 'nyu-train'."""
@@ -51,11 +51,11 @@ class Dataset(ABC):
     size: int | None
     """Number of samples; None = as many as one asks for."""
     fingerprint: str
-    """Changes whenever the samples change: caches are kept under it."""
+    """Names the caches of the samples, and changes whenever the samples change."""
     chunk: int = 64
-    """Samples to ask for at a time: enough to be efficient, few enough to fit the caches of a CPU."""
+    """How many samples to ask for at a time, enough to be efficient and few enough to fit the caches of a CPU."""
     cube_side: float = 0.30
-    """Metres; the usual side of the cubes, which whoever runs a network trained on them should use too."""
+    """The usual side of the cubes, in metres. A network that was trained on them should be run with it, too."""
 
     @abstractmethod
     def batch(self, indices: Tensor) -> Batch:
@@ -72,15 +72,17 @@ class LabelledFrame:
     joints: NDArray[np.float64]
     """(J, 3) metres, optical frame (x right, y down, z forward)."""
     seed: NDArray[np.float64]
-    """(3,) metres: where the search for the hand starts; the label of the palm, as in the original code."""
+    """(3,) metres, where the search for the hand starts. This is the label of the palm, as in the original code."""
     cube_side: float
-    """Metres; depends on the size of the subject's hand in some protocols."""
+    """Metres. In some protocols, it depends on the size of the hand of the subject."""
     left: bool = False
 
 
 class RecordedDataset(Dataset):
-    """Frames from disk. The crop follows the protocol of the original code (also used for its published numbers):
-    a cube at the *labelled* palm, the centre of mass of what is inside, and the cube again there.
+    """Frames from disk.
+
+    The crop follows the protocol of the original code, which is also that of its published numbers. A cube is put at
+    the *labelled* palm, and then moved to the centre of mass of what is inside.
     """
 
     @abstractmethod
@@ -119,9 +121,9 @@ def mirrored(patch: NDArray[Any], joints: NDArray[Any], center: tuple[float, flo
 
 
 def center_of_mass_cube(depth: NDArray[np.float32], seed: Cube, intrinsics: Intrinsics) -> Cube:
-    """A cube of the same side at the centre of mass of what is inside `seed`, or `seed` where that is nothing.
+    """A cube of the same side at the centre of mass of what is inside `seed`, or `seed` if nothing is.
 
-    As in the original code the mean is taken of column, row and depth, and projected back afterwards.
+    As in the original code, the mean is taken of column, row and depth, and projected back afterwards.
     """
     half, z = seed.side / 2, seed.center[2]
     (u, v), reach_u, reach_v = intrinsics.project(seed.center), intrinsics.fx * half / z, intrinsics.fy * half / z
@@ -142,10 +144,13 @@ def joints_in_metres(joints: Tensor, cube_center: Tensor, cube_side: Tensor) -> 
 
 
 def require(dataset: str, paths: Iterable[Path]) -> bytes:
-    """Make sure that files are there; what it returns changes with them, of which reading all bytes takes minutes.
+    """Make sure that files are there.
+
+    Returns:
+        Bytes that change with the names, sizes and times of the files. Reading the files themselves takes minutes.
 
     Raises:
-        DatasetError: some are not; the sentence names the first.
+        DatasetError: some are missing. The message names the first.
     """
     missing, states = [], []
     for path in paths:
@@ -163,19 +168,22 @@ def require(dataset: str, paths: Iterable[Path]) -> bytes:
 
 
 def are_labelled(joints: NDArray[Any]) -> NDArray[np.bool_]:
-    """Which hands (N,) of joints (N, J, 3) have all of them; one not finite or not before the camera is no label."""
+    """Which hands (N,) have all of their joints (N, J, 3).
+
+    A joint that is not finite or not in front of the camera is no label.
+    """
     return np.isfinite(joints).all((1, 2)) & (joints[..., 2] > 0).all(1)
 
 
 def tell_left_out(source: object, left_out: int, count: int) -> None:
-    """Log how many hands of a dataset or bag are not used, but not once more in each process that makes samples."""
+    """Log how many hands of a dataset or bag are not used. The processes that make samples do not log it again."""
     if left_out and multiprocessing.parent_process() is None:
         log.warning('%s: %s of %s hands have a joint that is not finite or not in front of the camera, and are left '
                     'out', source, left_out, count)
 
 
 def check_depth(dataset: str, path: Path, depth: NDArray[Any], intrinsics: Intrinsics) -> None:
-    """Raise DatasetError unless a depth image (H, W) is as large as those of the camera."""
+    """Raise DatasetError unless a depth image (H, W) has the size of the images of the camera."""
     (height, width), expected = depth.shape[:2], (intrinsics.width, intrinsics.height)
     if (width, height) != expected:
         raise DatasetError(f'{dataset}: {path} has {width}x{height} pixels, but the images of this dataset have '
@@ -205,7 +213,7 @@ def read_depth(path: Path, dataset: str, intrinsics: Intrinsics, channels: int =
 
 
 def fingerprint(name: str, *parts: bytes) -> str:
-    """A name for caches that changes with the parts and with the code that makes samples here."""
+    """A name for caches, which changes with the parts and with the code of this folder that makes samples."""
     digest = hashlib.sha256()
     for path in (*sorted(Path(__file__).parent.glob('*.py')), Path(hand_pose_ros.geometry.__file__)):
         digest.update(path.read_bytes())

@@ -23,15 +23,16 @@ INTRINSICS = Intrinsics(241.42, 241.42, 160.0, 120.0, 320, 240)
 PALM = 0
 
 ROTATED_COPY = 6
-"""Frames in folders with names of at most so many characters are turned copies of others; genuine ones have dates."""
+"""Folders whose names have at most this many characters hold rotated copies of frames. Those of genuine frames are
+named by date."""
 
 
 class ICVL(RecordedDataset):
     """`root`/{train.txt or labels.txt, test_seq_1.txt, test_seq_2.txt} and `root`/Depth/, or these under Training/ and
     Testing/, as distributed.
 
-    Splits: train and val (the genuine training frames; val is the sequence that is last by name), test, and test_1 and
-    test_2, its two sequences.
+    The splits train and val hold the genuine training frames. Val is the sequence whose name is last. The split test
+    has two sequences, which are also the splits test_1 and test_2.
     """
 
     skeleton = get_skeleton('icvl16')
@@ -57,7 +58,7 @@ class ICVL(RecordedDataset):
             frames = [frame for frame in frames if (_sequence(frame[0]) == last) == (split == 'val')]
             if not frames:
                 raise DatasetError(f'ICVL: all genuine frames of {lists[0]} are of the sequence {last}, which '
-                                   'validates: training needs another one')
+                                   'validates; add another sequence for training')
         whole = are_labelled(np.array([uvd for _, uvd in frames]).reshape(-1, 16, 3))
         tell_left_out(self.name, int((~whole).sum()), len(whole))
         self._depth = lists[0].parent / 'Depth'
@@ -88,12 +89,12 @@ def _sequence(path: str) -> str:
 
 
 def _read(path: Path) -> list[tuple[str, np.ndarray]]:
-    """Image path and (16, 3) u, v in pixels and depth in mm, line by line; blank lines are skipped."""
+    """For each line, the image path and (16, 3) u, v in pixels and depth in mm. Blank lines are skipped."""
     frames = []
     try:
         text = path.read_text()
     except UnicodeDecodeError:
-        raise DatasetError(f'ICVL: {path} is not text; is it packed? unpack it, or download it again') from None
+        raise DatasetError(f'ICVL: {path} is not text; unpack it if it is packed, or download it again') from None
     for number, line in enumerate(text.splitlines(), 1):
         words = line.split()
         if not words:

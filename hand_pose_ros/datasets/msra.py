@@ -23,7 +23,8 @@ from hand_pose_ros.skeleton import get_skeleton
 INTRINSICS = Intrinsics(241.42, 241.42, 160.0, 120.0, 320, 240)
 SEED = 5  # root of the middle finger
 CUBE_SIDES = (0.2, 0.2, 0.2, 0.18, 0.18, 0.18, 0.17, 0.16, 0.15)
-"""By subject (original code): knowledge of the size of the hand, to be told with every number that uses it."""
+"""Sides of the cubes by subject, in metres, as in the original code. They contain knowledge of the size of the hand, so
+every number that uses them must say so."""
 
 FAULTY = {
     ('P2', 'TIP'): {*range(172, 175)}, ('P2', 'MP'): {*range(173, 176), *range(345, 355), 356, 359, 360},
@@ -36,8 +37,9 @@ class MSRA(RecordedDataset):
     """`root`/P0 ... P8/GESTURE/ with joint.txt and %06d_depth.bin, as distributed.
 
     Args:
-        left_out: the subject that tests. The next one (after P8 comes P0) validates, the other seven train: choosing
-            a model on the subject that tests would tell more about the choice than about the model.
+        left_out: the subject that tests. The next one validates (after P8 comes P0), and the other seven train. If
+            a model were chosen on the subject that tests, its error there would tell more about the choice than about
+            the model.
     """
 
     skeleton = get_skeleton('msra21')
@@ -78,11 +80,13 @@ class MSRA(RecordedDataset):
 
 
 def read_bin(path: Path) -> np.ndarray:
-    """Depth (H, W) float32 in metres: six int32 (width, height, left, top, right, bottom), then the rows of that
-    rectangle as float32 in mm; around it there is nothing.
+    """Depth (H, W) float32 in metres, 0 = no reading.
+
+    The file holds six int32 (width, height, left, top, right, bottom), and then the rows of that rectangle as float32
+    in mm. Around the rectangle there is nothing.
 
     Raises:
-        DatasetError: missing, cut short or not of this format.
+        DatasetError: the file is missing, cut short or not of this format.
     """
     require('MSRA', [path])
     data = path.read_bytes()
@@ -98,7 +102,8 @@ def read_bin(path: Path) -> np.ndarray:
 
 
 def _read_gesture(folder: Path) -> list[tuple[Path, np.ndarray]]:
-    """Depth file and joints (21, 3) of every frame, by the number in the file name: some numbers are not there."""
+    """Depth file and joints (21, 3) in metres of every frame. The number in the file name tells the label, because
+    some numbers are missing."""
     labels = folder / 'joint.txt'
     require('MSRA', [labels])
     try:
@@ -115,7 +120,8 @@ def _read_gesture(folder: Path) -> list[tuple[Path, np.ndarray]]:
         match = re.fullmatch(r'(\d{6})_depth\.bin', path.name)
         if match and (number := int(match[1])) not in faulty:
             if number >= len(joints):
-                raise DatasetError(f'MSRA: {path} has no label: {labels} has only {len(joints)}')
+                raise DatasetError(f'MSRA: {path} has no label, because {labels} has only {len(joints)} labels; '
+                                   'copy or download them again')
             frames.append((path, joints[number]))
     if not frames:
         raise DatasetError(f'MSRA: {folder} holds labels but no depth images (000000_depth.bin and so on)')

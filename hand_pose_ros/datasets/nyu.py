@@ -24,20 +24,21 @@ from hand_pose_ros.skeleton import get_skeleton
 INTRINSICS = Intrinsics(588.03, 587.07, 320.0, 240.0, 640, 480)
 
 JOINTS = (0, 3, 6, 9, 12, 15, 18, 21, 24, 25, 27, 30, 31, 32)
-"""The 14 that are evaluated, of the 36 labelled ones; in the order of the skeleton nyu14."""
+"""The 14 of the 36 labelled joints that are evaluated, in the order of the skeleton nyu14."""
 PALM = 13
 
 FIRST_SUBJECT = 2440
-"""Test frames of the first subject; the rest shows a smaller hand."""
+"""Number of test frames of the first subject. The rest shows a smaller hand."""
 HELD_OUT = 0.05
-"""Share of the training frames, the last ones, that validate: the training set has a single subject."""
+"""Share of the training frames that validate. They are the last ones, because no subject can be held out: there is only
+one."""
 
 
 def read_nyu_depth(path: Path) -> NDArray[np.float32]:
     """Depth (H, W) in metres of a frame, 0 = no reading.
 
-    It is packed into the colours of a PNG, green for the high byte of the millimetres, blue for the low; 2001 and
-    above is no reading.
+    It is packed into the colours of a PNG. Green is the high byte of the millimetres, and blue the low byte. 2001 mm
+    and above is no reading.
 
     Raises:
         DatasetError: the file is missing, damaged, or of another kind or size.
@@ -50,7 +51,8 @@ def read_nyu_depth(path: Path) -> NDArray[np.float32]:
 class NYU(RecordedDataset):
     """`root`/{train,test}/joint_data.mat with depth_1_%07d.png beside it, as distributed.
 
-    Splits: train and val (the training frames), test, and test_1 and test_2, its two subjects.
+    The splits train and val hold the training frames. The split test has two subjects, which are also the splits test_1
+    and test_2.
     """
 
     skeleton = get_skeleton('nyu14')
@@ -90,5 +92,5 @@ class NYU(RecordedDataset):
         depth = read_nyu_depth(self._path(frame))
         joints = self._joints[frame]
         smaller = self._folder.name == 'test' and frame >= FIRST_SUBJECT
-        # The factor is the original authors' knowledge of the subject's hand: say so with every number that uses it.
+        # The factor is the original authors' knowledge of the subject's hand. Every number that uses it must say so.
         return LabelledFrame(depth, INTRINSICS, joints, joints[PALM], 0.300 * (0.83 if smaller else 1))

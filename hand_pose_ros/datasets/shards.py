@@ -1,6 +1,6 @@
 """Samples rendered or decoded once and read many times.
 
-Shard i of a dataset always holds the samples [i N, (i + 1) N), so whoever makes it, and whenever, makes the same one.
+Shard i of a dataset always holds the samples [i N, (i + 1) N), so it is the same whoever makes it, and whenever.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ log = logging.getLogger(__name__)
 
 
 def make_shard(dataset: Dataset, shard: int, shard_size: int) -> Batch:
-    """The samples of one shard; patches as float16, which is 0.04 mm in a cube of 0.3 m."""
+    """The samples of one shard. Patches are float16, which is exact to 0.04 mm in a cube of 0.3 m."""
     end = (shard + 1) * shard_size if dataset.size is None else min((shard + 1) * shard_size, dataset.size)
     parts = []
     for indices in torch.arange(shard * shard_size, end).split(dataset.chunk):
@@ -41,7 +41,7 @@ def make_shard(dataset: Dataset, shard: int, shard_size: int) -> Batch:
 
 
 class MemoryShards:
-    """Shards made when they are first asked for, and kept on the device that made them: for rendering on a GPU."""
+    """Shards for rendering on a GPU, made when they are first asked for, and kept on the device that made them."""
 
     ahead = 0
 
@@ -65,14 +65,14 @@ class MemoryShards:
 class DiskShards:
     """Shards in files, made ahead by processes of their own and mapped into memory.
 
-    A file appears under its name only when it is complete and carries a checksum, so a run that is killed leaves
+    A file appears under its name only when it is complete, and it carries a checksum. So a run that is killed leaves
     nothing half-made, and several runs can share a folder.
 
     Args:
-        open_dataset: makes the dataset; called here and in every process, so it must be picklable.
+        open_dataset: makes the dataset. It is called here and in every process, so it must be picklable.
         folder: where the shards of all datasets are kept.
         workers: processes that make shards.
-        limit_gb: delete the shards that were not used for longest when the folder grows beyond this.
+        limit_gb: size of the folder beyond which the shards that were not used for longest are deleted.
         device: where the shards are read to.
     """
 
@@ -80,7 +80,7 @@ class DiskShards:
                  limit_gb: float = 40, device: torch.device | None = None) -> None:
         self.dataset, self.shard_size = open_dataset(), shard_size
         self.ahead = max(4, 2 * workers)
-        """How many shards beyond the needed ones are made in advance: every worker is to have the next one waiting."""
+        """How many shards beyond the needed ones are made in advance, so that every worker has the next one waiting."""
         self._device = device or torch.device('cpu')
         self._folder = folder / f'{self.dataset.fingerprint}-{shard_size}'
         self._folder.mkdir(parents=True, exist_ok=True)
@@ -104,7 +104,7 @@ class DiskShards:
                     log.info('making samples of %s, which may take minutes; they are kept in %s',
                              self.dataset.name, self._folder)
                     self._pool = self._start_pool()
-                # The training run decides when to stop: a worker, which this starts, inherits what is blocked.
+                # A worker that this starts inherits what is blocked, as only the training run decides when to stop.
                 blocked = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
                 try:
                     self._making[shard] = self._pool.submit(_make_file, shard, self.path(shard))
@@ -123,7 +123,7 @@ class DiskShards:
             try:
                 tensors = read_shard(self.path(shard), check=not fresh)
                 self._open[shard] = {key: value.to(self._device) for key, value in tensors.items()}
-            except PermissionError as error:  # made by another user: not ours to make again
+            except PermissionError as error:  # made by another user, so it is not ours to make again
                 raise DatasetError(f'{self.path(shard)} cannot be read ({error.strerror}): correct its permissions, or '
                                    'choose another --cache') from None
             except (FileNotFoundError, DatasetError):  # not made yet, deleted to make room, or damaged: make it
@@ -139,7 +139,7 @@ class DiskShards:
                                '(is there enough memory?); continue with --resume') from error
 
     def close(self) -> None:
-        """Stop making shards, at once: those that are not complete are lost."""
+        """Stop making shards at once. Those that are not complete are lost."""
         pool, self._pool = self._pool, None
         self._making.clear()
         if pool is None:
@@ -154,14 +154,14 @@ class DiskShards:
 
 
 def read_shard(path: Path, check: bool = True) -> Batch:
-    """The tensors of a shard, mapped from its file; `check` that they are those that were written.
+    """The tensors of a shard, mapped from its file. With `check`, they must be those that were written.
 
     Raises:
         FileNotFoundError: there is no such file.
         PermissionError: it may not be read.
-        DatasetError: the file is damaged.
+        DatasetError: the file is damaged, or with `check`, does not match its checksum.
     """
-    os.close(os.open(path, os.O_RDONLY))  # safetensors takes a file that may not be read for missing
+    os.close(os.open(path, os.O_RDONLY))  # safetensors says of a file that may not be read that it is missing
     try:
         with safe_open(path, 'pt') as file:
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
@@ -170,7 +170,7 @@ def read_shard(path: Path, check: bool = True) -> Batch:
         raise DatasetError(f'{path} is damaged ({error}); delete it and it is made again') from error
     if check and checksum != _checksum(tensors):
         raise DatasetError(f'{path} does not match its checksum; delete it and it is made again')
-    with suppress(PermissionError):  # made by another user, who may have it deleted sooner
+    with suppress(PermissionError):  # made by another user, so it may be deleted sooner
         os.utime(path)
     return tensors
 
@@ -197,11 +197,11 @@ def _start_worker(open_dataset: Callable[[], Dataset], shard_size: int, root: Pa
 
 def _make_file(shard: int, path: Path) -> None:
     dataset, shard_size, root, limit = _worker
-    # The processes of a run under torchrun all ask for the same shards: who waits here finds one made, and goes on.
+    # The processes of a run under torchrun all ask for the same shards. Those that wait here find the shard made.
     with FileLock(path.with_suffix('.lock')):
         if path.exists():
             return
-        for left in path.parent.glob(f'.{path.name}.*.part'):  # by a process that was killed, which held the lock
+        for left in path.parent.glob(f'.{path.name}.*.part'):  # by a process that was killed while it held the lock
             left.unlink(missing_ok=True)
         tensors = {key: value.cpu().contiguous() for key, value in make_shard(dataset, shard, shard_size).items()}
         with in_one_step(path) as part:
@@ -210,7 +210,7 @@ def _make_file(shard: int, path: Path) -> None:
 
 
 def _limit_size(root: Path, limit: int, made: Path) -> None:
-    """Delete the shards that were used longest ago, but not the one just made; whoever has one open keeps it."""
+    """Delete the shards that were used longest ago, but not the one just made. Who has one open can still read it."""
     files = []
     for path in root.glob('*/*.safetensors'):
         with suppress(FileNotFoundError):  # another process may make room, too

@@ -19,17 +19,17 @@ from hand_pose_ros.synthetic.generator import LEFT, SyntheticHands
 from hand_pose_ros.synthetic.stages import Ingredients
 
 INGREDIENTS = tuple(field.name for field in dataclasses.fields(Ingredients))
-"""What a variant can do without."""
+"""Names of what a variant can leave out."""
 
 
 class Synthetic(Dataset):
-    """Endless samples of one split; 'train', 'val' and 'test' share no identity, no pose and no seed.
+    """Endless samples of one split. 'train', 'val' and 'test' share no identity, no pose and no seed.
 
     Args:
         split: 'train', 'val' or 'test'.
         device: where they are rendered.
-        variant: '' or 'without-NAME' with an ingredient, or 'everything': the training samples lack it, the others are
-            complete all the same, for what it is worth shows on them.
+        variant: '' or 'without-NAME', where NAME is an ingredient or 'everything'. Only training samples lack it. Those
+            of the other splits are complete, because on them it shows what the ingredient is worth.
 
     Raises:
         DatasetError: an unknown split or variant.
@@ -46,7 +46,7 @@ class Synthetic(Dataset):
         self.name = '-'.join(filter(None, ('synthetic', split, variant)))
         self.device = torch.device(device)
         try:
-            # The test split is the benchmark synthetic-test-v1 and goes on behind its end.
+            # The test split begins with the benchmark synthetic-test-v1, and goes on after its end.
             self._hands = SyntheticHands(split, device=device, sensors=SENSORS if split == 'test' else None,
                                          ingredients=ingredients)
         except HandPoseError as error:
@@ -67,11 +67,13 @@ def seen_centers(hands: Batch) -> Tensor:
 
 
 class SyntheticScenes(Dataset):
-    """Whole images of the same scenes, for `hand_finder`, of 160 x 128 pixels.
+    """Whole images of the same scenes, of 160 x 128 pixels, for `hand_finder`.
 
-    `patch` (B, 1, 128, 160) is depth in metres, 0 = no reading; `joints` (B, 2, 3) are the middles of one or two hands,
-    in a cube of 2 m whose centre is 1 m before a camera that looks through the middle of the image: x / z, y / z and
-    z - 1; `shown` (B, 2) tells whether that hand is there. `hand_present` is the same of the first.
+    - `patch` (B, 1, 128, 160) is depth in metres, 0 = no reading.
+    - `joints` (B, 2, 3) are the middles of one or two hands, as x / z, y / z and z - 1. They are in a cube of 2 m whose
+      centre is 1 m in front of a camera that looks through the middle of the image.
+    - `shown` (B, 2) tells whether that hand is there.
+    - `hand_present` (B,) is `shown` of the first hand.
 
     Raises:
         DatasetError: an unknown split.
@@ -102,7 +104,7 @@ class SyntheticScenes(Dataset):
 
 
 def _code() -> str:
-    """Any change of the code that makes the samples makes other samples."""
+    """Changes with the code that makes the samples, because any change of it may make other samples."""
     sources = sorted(Path(hand_pose_ros.synthetic.__path__[0]).glob('*.py'))
     return hashlib.sha256(b''.join(path.read_bytes() for path in (*sources, Path(__file__)))).hexdigest()[:12]
 

@@ -147,7 +147,7 @@ def require(dataset: str, paths: Iterable[Path]) -> bytes:
     """Make sure that files are there.
 
     Returns:
-        Bytes that change with the names, sizes and times of the files. Reading the files themselves takes minutes.
+        Bytes that change with the names, sizes and times of the files. Reading the files themselves would take minutes.
 
     Raises:
         DatasetError: some are missing. The message names the first.

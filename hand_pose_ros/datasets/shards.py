@@ -159,7 +159,7 @@ def read_shard(path: Path, check: bool = True) -> Batch:
     Raises:
         FileNotFoundError: there is no such file.
         PermissionError: it may not be read.
-        DatasetError: the file is damaged, or with `check`, does not match its checksum.
+        DatasetError: the file is damaged, or, with `check`, does not match its checksum.
     """
     os.close(os.open(path, os.O_RDONLY))  # safetensors says of a file that may not be read that it is missing
     try:

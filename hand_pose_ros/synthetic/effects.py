@@ -31,9 +31,9 @@ _KINDS = {'white': 0.0, 'smooth': 2.0, 'blobs': 6.0}  # standard deviation of th
 
 @cache
 def _noise(kind: str, height: int, width: int, device: torch.device) -> Tensor:
-    """All cuts of height x width pixels from a tile of normal noise of unit variance, which repeats itself.
+    """All cuts of height x width pixels from a tile of normal noise of unit variance.
 
-    They are a view (_TILE, _TILE, height, width) of one plane.
+    They are a view (_TILE, _TILE, height, width) of a plane in which the tile repeats itself.
     """
     tile = Random(torch.tensor([list(_KINDS).index(kind)])).normal(_TILE, _TILE)[0]
     frequency = torch.fft.fftfreq(_TILE)

@@ -29,7 +29,7 @@ class Furnisher:
         return self.rng.fork(self._stream)
 
     def _chance(self, rng: Random, shares: dict[str, float]) -> Tensor:
-        """Samples (K,), chosen with the share of their view, or with that of 'any' for views that have no own share."""
+        """Samples (K,), chosen with the share of their view, or with that of 'any' if their view has none."""
         table = torch.tensor([shares.get(name, shares['any']) for name in VIEWS], device=rng.device)
         return (rng.uniform() < table[self.view]).nonzero()[:, 0]
 

@@ -1,9 +1,9 @@
 """The poses of hands: gestures, mixtures of two, and wide random poses, all within the limits of the joints.
 
-Limits and couplings are those of the biomechanics literature (Sancho-Bru, clinical ranges). How
-differently the four fingers bend was set to agree with statistics of the pose bank of Intel's hand_tracking_samples
-(Apache-2.0). Only means, correlations and percentiles were used, and no pose. There, wrists are bent back by 15 degrees
-on average. Neighbouring fingers bend with a correlation of 0.85 to 0.95, and index and little finger with one of 0.65.
+Limits and couplings are those of the biomechanics literature (Sancho-Bru, clinical ranges). How differently the
+four fingers bend was set to agree with statistics of the pose bank of Intel's hand_tracking_samples (Apache-2.0). Only
+means, correlations and percentiles were used, and no pose. There, wrists are bent back by 15 degrees on average.
+Neighbouring fingers bend with a correlation of 0.85 to 0.95, and index and little finger with one of 0.65.
 """
 
 from __future__ import annotations

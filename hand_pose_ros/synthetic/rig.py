@@ -162,7 +162,7 @@ class Rig(SkinnedHand):
         points, faces, joints = _turned(path, vertices, faces, joints)
         heads = np.array([[joints[name][:, 3] for name in names] for names in _CHAINS.values()])
 
-        # For each joint of the rig, the bone of ours that carries the same skin. Then the axes of these bones.
+        # Which of our bones carries the skin of each joint of the rig, and the axes of these bones.
         owner = {name: DIGIT[digit] + 2 * min(i, 2) + 1
                  for digit, names in enumerate(_CHAINS.values()) for i, name in enumerate(names)}
         owner |= {f'{finger}-finger-metacarpal': METACARPAL[digit] for digit, finger in enumerate(FINGERS) if digit}

@@ -58,7 +58,7 @@ class Ingredients:
 
 @dataclass
 class Motion:
-    """How hands depart from those of their sample. There is one row, or several to move between.
+    """How hands depart from those of their samples, as one row or as several to move between.
 
     Attributes:
         pose: (N, P) radians. It replaces the pose of the sample.
@@ -145,7 +145,7 @@ class _Armed(nn.Module):
 
 
 class Stages:
-    """Makes stages. See `SyntheticHands` for the arguments, but `sensors` are indices in SENSORS to draw from."""
+    """Makes stages. The arguments are those of `SyntheticHands`, but `sensors` are indices in SENSORS to draw from."""
 
     def __init__(self, ingredients: Ingredients, sensors: Tensor, hand: SkinnedHand, device: torch.device) -> None:
         self.ingredients = ingredients

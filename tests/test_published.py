@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from hand_pose_ros.cli import main
+from hand_pose_ros.datasets.nyu import PALM
 from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.evaluation import tompson
 from hand_pose_ros.evaluation.published import DATASETS, load_published, load_result, read_text
@@ -197,17 +198,26 @@ def test_tompson_protocol_on_the_frame_that_is_there(shared_data, tmp_path):
     assert paper[~beside] == pytest.approx(code[~beside]) and code.max() < 30
 
 
+def test_the_cube_of_the_second_subject_is_smaller(shared_data, tmp_path):
+    for row in (2439, 2440):  # the last of the first subject, the first of the second; nothing is measured
+        cv2.imwrite(str(tmp_path / f'depth_1_{row + 1:07d}.png'), np.zeros((480, 640, 3), np.uint8))
+    folder = shared_data / 'published' / 'nyu'
+    result = tompson.load_tompson(folder / 'Tompson_2d.npz', folder / 'groundtruth.txt.gz', tmp_path, NYU)
+    behind = result.predictions[..., 2] - result.truth[:, PALM, None, 2]
+    assert behind[2439] == pytest.approx(0.300 / 2) and behind[2440] == pytest.approx(0.249 / 2)
+
+
 def test_lifting_a_hand_worked_case():
-    camera = Intrinsics(100, 100, 10, 10, 20, 20)
-    depth = np.zeros((20, 20), np.float32)
-    depth[10, 10], depth[10, 15], depth[5, 10] = 0.6, 0.9, 0.3  # the hand, the wall behind, something before
+    camera = Intrinsics(100, 100, 10, 10, 30, 20)
+    depth = np.zeros((20, 30), np.float32)
+    depth[10, 10], depth[10, 15], depth[5, 10] = 0.6, 0.82, 0.3  # the hand, what is just behind, something before
     depth[0, 0] = 0.7
-    pixels = np.array([[10.4, 9.6], [15, 10], [10, 5], [2, 2], [20, 3], [3, 20], [0, 0]])
-    truth = np.array([0.61, 0.62, 0.63, 0.64, 0.65, 0.66, 0.67])
+    pixels = np.array([[10.4, 9.6], [15, 10], [10, 5], [2, 2], [30, 3], [3, 20], [0, 0]])
+    truth = np.array([0.61, 0.79, 0.63, 0.64, 0.65, 0.66, 0.67])
     paper = tompson.lift(pixels, depth, camera, 0.65, 0.3, truth, 'paper')
     assert paper[:, 2] == pytest.approx([0.6, 0.8, 0.8, 0.8, 0.8, 0.8, 0.7]), 'the back face of the cube is at 0.8 m'
     code = tompson.lift(pixels, depth, camera, 0.65, 0.3, truth, 'code')
-    assert code[:, 2] == pytest.approx([0.6, 0.62, 0.63, 0.64, 0.65, 0.66, 0.7])
+    assert code[:, 2] == pytest.approx([0.6, 0.79, 0.63, 0.64, 0.65, 0.66, 0.7])
     assert camera.project(paper) == pytest.approx(pixels)
 
 

@@ -205,6 +205,21 @@ def test_the_cube_of_the_second_subject_is_smaller(shared_data, tmp_path):
     result = tompson.load_tompson(folder / 'Tompson_2d.npz', folder / 'groundtruth.txt.gz', tmp_path, NYU)
     behind = result.predictions[..., 2] - result.truth[:, PALM, None, 2]
     assert behind[2439] == pytest.approx(0.300 / 2) and behind[2440] == pytest.approx(0.249 / 2)
+    assert list(result.summary()['parts']) == ['subject 1', 'subject 2']
+
+
+def test_what_cannot_be_lifted_is_refused(shared_data, tmp_path):
+    folder = shared_data / 'published' / 'nyu'
+    truth, whole = folder / 'groundtruth.txt.gz', (folder / 'Tompson_2d.npz').read_bytes()
+    (tmp_path / 'cut.npz').write_bytes(whole[:len(whole) // 2])
+    np.savez(tmp_path / 'other.npz', joints=np.zeros(3))
+    np.savez(tmp_path / 'few.npz', uv=np.zeros((5, 14, 2)))
+    for name, message in (('cut.npz', 'not an .npz file with 2D joints'), ('other.npz', 'not an .npz file with 2D'),
+                          ('few.npz', r'2D joints of shape \(5, 14, 2\)')):
+        with pytest.raises(InputError, match=message):
+            tompson.load_tompson(tmp_path / name, truth, tmp_path, NYU)
+    with pytest.raises(InputError, match=r'none of depth_1_0000001\.png'):
+        tompson.load_tompson(folder / 'Tompson_2d.npz', truth, tmp_path, NYU)
 
 
 def test_lifting_a_hand_worked_case():

@@ -145,6 +145,12 @@ def test_truth_of_other_joints_or_in_another_frame_is_refused(tmp_path, model, r
             bag.write_hands(10**9, frame, [hand], skeleton, '/truth/joints')
         assert main(arguments(tmp_path / f'{k}.mcap', model, '--ground-truth', '/truth/joints')) == 1
         assert message in capsys.readouterr().err
+    for name, hands, message in (('two', [hand, hand], 'has 2 hands at 1000000000 ns'), ('none', [], 'has no hand in')):
+        with BagWriter(tmp_path / f'{name}.mcap') as bag:
+            bag.write_depth(10**9, 'camera', depth_image(0), CAMERA, codec=None)
+            bag.write_hands(10**9, 'camera', hands, HAND21, '/truth/joints')
+        assert main(arguments(tmp_path / f'{name}.mcap', model, '--ground-truth', '/truth/joints')) == 1
+        assert message in capsys.readouterr().err
 
 
 def test_truth_that_does_not_fit_is_refused(tmp_path, bag, model, result, capsys, monkeypatch):

@@ -24,6 +24,7 @@ from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.estimator import HandEstimate, HandPoseEstimator
 from hand_pose_ros.evaluation import bag_evaluation
 from hand_pose_ros.evaluation.bag_evaluation import Settings, evaluate_bag, evaluate_bags
+from hand_pose_ros.evaluation.ground_truth import Truth, with_truth
 from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.geometry import Cube, Intrinsics
 from hand_pose_ros.skeleton import HAND21, get_skeleton
@@ -132,6 +133,17 @@ def test_truth_from_a_topic_a_file_or_text_gives_the_same_error(tmp_path, model,
     assert got['mean_mm'] == pytest.approx(10, abs=1e-3) and got['max_mm'] == pytest.approx(10, abs=1e-3)
     assert got['error_jitter_mm'] == pytest.approx(0, abs=1e-3) and got['mean_rigid_aligned_mm'] < 1e-3
     assert Result.load(tmp_path / 'r.npz').summary()['mean_mm'] == got['mean_mm']
+
+
+def test_a_label_belongs_to_the_nearest_image_and_to_no_other(result):
+    # The third label is between two images, too far from both. No image from 2 on has a nearer label than these two.
+    stamps = result.stamps_ns[[0, 2, 6]] + [0, STEP_NS // 4, STEP_NS // 2]
+    labels = Truth('labels', result.predictions[[0, 2, 6]], stamps)
+    scored = with_truth(result, labels, 'camera')
+    labelled = np.isfinite(scored.truth).all((1, 2))
+    assert np.flatnonzero(labelled).tolist() == [0, 2]
+    np.testing.assert_array_equal(scored.truth[2], result.predictions[2])
+    assert f'{FRAMES - 2} of {FRAMES} images have no label in labels' in scored.notes[-1]
 
 
 def test_truth_of_other_joints_or_in_another_frame_is_refused(tmp_path, model, result, capsys):

@@ -83,6 +83,16 @@ def test_listing_the_verbs_loads_no_heavy_library():
 
 
 @pytest.mark.skipif(sys.platform != 'linux', reason='elsewhere there is always a display')
+@pytest.mark.parametrize(('option', 'wanted'), [
+    ('--max-hands', 'a whole number'), ('--depth-scale', 'a number'), ('--cube-size', 'a number'),
+    ('--min-score', 'a number')])
+def test_text_where_a_number_belongs_is_told_in_plain_words(option, wanted, capsys):
+    with pytest.raises(SystemExit) as exit_:
+        main(['estimate', 'x', option, 'many'])
+    assert exit_.value.code == 2
+    assert f'argument {option}: many is not {wanted} (' in capsys.readouterr().err
+
+
 def test_to_view_without_a_display_is_refused_at_once(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, 'rerun', SimpleNamespace(blueprint=None))  # as if it were installed
     for name in ('DISPLAY', 'WAYLAND_DISPLAY'):

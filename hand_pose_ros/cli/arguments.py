@@ -16,9 +16,23 @@ if TYPE_CHECKING:
     from hand_pose_ros.estimator import HandPoseEstimator
 
 
+def _whole(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:  # of it, argparse would name the function
+        raise argparse.ArgumentTypeError(f'{text} is not a whole number') from None
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f'{text} is not a number') from None
+
+
 def count(text: str) -> int:
     """1 or more."""
-    value = int(text)
+    value = _whole(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f'{text} is less than 1')
     return value
@@ -26,7 +40,7 @@ def count(text: str) -> int:
 
 def share(text: str) -> float:
     """0 to 1."""
-    value = float(text)
+    value = _number(text)
     if not 0 <= value <= 1:
         raise argparse.ArgumentTypeError(f'{text} is not between 0 and 1')
     return value
@@ -34,7 +48,7 @@ def share(text: str) -> float:
 
 def metres(text: str) -> float:
     """More than 0 and at most 1, as the unit of depth is."""
-    value = float(text)
+    value = _number(text)
     if not 0 < value <= 1:
         raise argparse.ArgumentTypeError(f'{text} is not more than 0 and at most 1 (metres)')
     return value
@@ -42,7 +56,7 @@ def metres(text: str) -> float:
 
 def cube(text: str) -> float:
     """0.05 to 1 m, as the node takes it."""
-    value = float(text)
+    value = _number(text)
     if not 0.05 <= value <= 1:
         raise argparse.ArgumentTypeError(f'{text} is not between 0.05 and 1 (metres)')
     return value
@@ -50,7 +64,7 @@ def cube(text: str) -> float:
 
 def none_or_more(text: str) -> int:
     """0 or more."""
-    value = int(text)
+    value = _whole(text)
     if value < 0:
         raise argparse.ArgumentTypeError(f'{text} is less than 0')
     return value

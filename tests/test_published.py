@@ -186,6 +186,16 @@ def test_nyu_frame_1_is_decoded_and_lies_before_its_joints(shared_data):
     assert in_front.min() > 2 and in_front.max() < 33, 'the skin lies before the joint'
 
 
+def test_2d_joints_that_are_not_there_are_told_apart_from_a_file_of_another_kind(tmp_path, capsys):
+    arguments = ['evaluate', '--predictions', str(tmp_path / 'p.npz'), '--ground-truth', 'truth.txt',
+                 '--dataset', 'nyu']
+    assert main([*arguments, '--depth-folder', str(tmp_path)]) == 1
+    assert 'p.npz: the file cannot be read (No such file or directory)' in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(arguments)
+    assert 'p.npz: an .npz file holds 2D joints, which need --depth-folder' in capsys.readouterr().err
+
+
 def test_tompson_protocol_on_the_frame_that_is_there(shared_data, tmp_path):
     folder, results = shared_data / 'published' / 'nyu', {}
     for protocol in ('paper', 'code'):

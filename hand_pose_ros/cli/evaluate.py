@@ -122,7 +122,8 @@ def _run_text(args: argparse.Namespace) -> int:
 
     if Path(args.predictions).suffix == '.npz':
         if not args.depth_folder:
-            args.parser.error('2D joints need --depth-folder')
+            args.parser.error(f'--predictions {args.predictions}: an .npz file holds 2D joints, which need '
+                              '--depth-folder')
         result = tompson.load_tompson(args.predictions, args.ground_truth, args.depth_folder, dataset, args.protocol)
     else:
         result = published.load_published(args.predictions, args.ground_truth, dataset)

@@ -76,7 +76,9 @@ def load_tompson(predictions: str | Path, truth: str | Path, folder: str | Path,
     try:
         with np.load(predictions) as file:
             pixels = file['uv'].astype(np.float64)
-    except (OSError, *DAMAGE):
+    except OSError as error:
+        raise InputError(f'{predictions}: the file cannot be read ({error.strerror or error})') from None
+    except DAMAGE:
         raise InputError(f'{predictions}: not an .npz file with 2D joints `uv` of shape (frames, 14, 2)') from None
     label = read_text(truth, dataset.skeleton)
     if dataset.name != 'nyu' or pixels.shape != (dataset.frames, len(dataset.skeleton), 2) \

@@ -368,7 +368,7 @@ def test_hands_come_back_as_written(tmp_path):
     for message in last.hands:
         center = message.cube_center
         assert (center.x, center.y, center.z, message.cube_size) == pytest.approx((0.1, -0.2, 0.6, 0.25))
-    with pytest.raises(InputError, match='named /other, but the bag has /hand/joints'):
+    with pytest.raises(InputError, match='no hand_pose_ros/HandJointsArray on /other: choose one of /hand/joints'):
         read_hands(tmp_path / 'hands.mcap', topic='/other')
     message = typestore().types['hand_pose_ros/msg/HandJoints']
     assert [getattr(message, side.upper()) for side in SIDES] == [0, 1, 2]

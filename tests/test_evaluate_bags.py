@@ -181,7 +181,8 @@ def test_truth_that_does_not_fit_is_refused(tmp_path, bag, model, result, capsys
             (tmp_path / 'stamps.npz', 'stamps_ns of shape (11,) for 12 labels'),
             (tmp_path / 'none.npz', 'joints has no labels'), (tmp_path / 'one.npz', 'the truth has the shape ()'),
             (tmp_path / 'array.npz', 'array joints'),
-            ('/truth/joints', 'HandJointsArray named /truth/joints'), ('truth.csv', 'no such file')):
+            ('/truth/joints', 'no hand_pose_ros/HandJointsArray on /truth/joints: choose another bag'),
+            ('truth.csv', 'no such file'), (tmp_path / 'lost.npz', 'no such file')):
         assert main(arguments(bag, model, '--ground-truth', source)) == 1
         assert message in capsys.readouterr().err
     monkeypatch.setattr(HandPoseEstimator, '__call__', lambda *_, **__: pytest.fail('what is wrong is told first'))

@@ -223,8 +223,9 @@ def read_hands(path: str | os.PathLike[str], topic: str | None = None, *, partly
         topics = sorted({c.topic for c in found})
         if len(topics) != 1:
             there = ', '.join(sorted({c.topic for c in hands}))
-            raise InputError(f'{path}: needed is one topic of {_ros_name(HANDS)}{f" named {topic}" if topic else ""}, '
-                             f'but the bag has {there or "none"}: give the name of the topic')
+            what = f'several topics carry {_ros_name(HANDS)}' if topics else \
+                f'there is no {_ros_name(HANDS)} on {topic or "any topic"}'
+            raise InputError(f'{path}: {what}: ' + (f'choose one of {there}' if there else 'choose another bag'))
         recorded: list[RecordedHands] = []
         try:
             for connection, _, data in bag.messages(found):

@@ -58,7 +58,7 @@ def read_truth(source: str, bag: str | Path, skeleton: Skeleton) -> Truth:
             raise InputError(f'{source}: the truth has the shape {shape}, but the joints of the estimator '
                              f'({skeleton.name}) need (frames, {expected[0]}, 3)')
         if not len(truth.joints):
-            raise InputError(f'{source}: joints has no labels, so there is nothing to compare with')
+            raise InputError(f'{source}: its array joints has no labels, so there is nothing to compare with')
         if truth.stamps_ns is not None and truth.stamps_ns.shape != shape[:1]:
             raise InputError(f'{source}: stamps_ns of shape {truth.stamps_ns.shape} for {shape[0]} labels: give one '
                              'for each')
@@ -91,8 +91,9 @@ def with_truth(result: Result, truth: Truth, frame_id: str) -> Result:
 
 def _read(source: str, bag: str | Path, skeleton: Skeleton) -> Truth:
     if not Path(source).is_file():
-        if not source.startswith('/'):
-            raise InputError(f'{source}: there is no such file, and it is no topic either, which begins with /')
+        if not source.startswith('/') or '.' in source:
+            raise InputError(f'{source}: there is no such file, and it is no topic either, which begins with / and has '
+                             'no dot')
         return _read_topic(source, bag, skeleton)
     if Path(source).suffix != '.npz':
         return Truth(source, read_text(source, skeleton))

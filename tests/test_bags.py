@@ -189,6 +189,9 @@ def test_of_several_depth_topics_one_must_be_chosen(tmp_path, depths):
         bag._writer.add_connection('/never/image', 'sensor_msgs/msg/Image', typestore=typestore())
     with pytest.raises(InputError, match=r'several topics carry depth: choose one of /left/image, /right/image'):
         DepthBag(tmp_path / 'two.mcap')
+    with pytest.raises(InputError, match='on /never/image: give another depth topic') as error:
+        DepthBag(tmp_path / 'two.mcap', depth_topic='/never/image')
+    assert str(error.value).count('/never/image') == 1, 'what was never published is not among what the bag has'
     with DepthBag(tmp_path / 'two.mcap', depth_topic='/right/image') as bag:
         [frame] = bag
     np.testing.assert_array_equal(frame.depth, depths[1])

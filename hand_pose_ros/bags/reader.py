@@ -179,7 +179,8 @@ class DepthBag(Bag):
         return found
 
     def _topics(self) -> str:
-        return ', '.join(sorted({f'{c.topic} [{_ros_name(c.msgtype)}]' for c in self.connections})) or 'no topics'
+        return ', '.join(sorted({f'{c.topic} [{_ros_name(c.msgtype)}]' for c in self.connections if c.msgcount})
+                         ) or 'no messages'
 
 
 @dataclass(frozen=True)

@@ -385,7 +385,7 @@ def test_compare_refuses_what_cannot_be_compared(result, tmp_path, capsys):
     assert 'two - one: +0.000 mm, 95 % interval' in capsys.readouterr().out, 'some images have no labels'
     replace(result, predictions=np.full_like(result.predictions, np.nan)).save(tmp_path / 'lost.npz')
     assert main(['compare', a, str(tmp_path / 'lost.npz'), '--json', str(tmp_path / 'c.json')]) == 0
-    assert 'have less than two frames with a hand in common' in capsys.readouterr().err
+    assert 'have fewer than two frames with a hand in common' in capsys.readouterr().err
     assert len(json.loads((tmp_path / 'c.json').read_text())['results']) == 2
     assert main(['compare', a, blind]) == 1
     assert 'blind has no ground truth' in capsys.readouterr().err

@@ -87,5 +87,5 @@ def _not_paired(a: Result, b: Result) -> str:
     if not np.allclose(a.truth, b.truth, atol=1e-6, equal_nan=True):
         return 'were evaluated on different truth'
     if np.isfinite(metrics.frame_means_mm(a.errors_mm) + metrics.frame_means_mm(b.errors_mm)).sum() < 2:
-        return 'have less than two frames with a hand in common'
+        return 'have fewer than two frames with a hand in common'
     return ''

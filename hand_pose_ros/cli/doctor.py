@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
         for level, text in _examine(check):
             wrong += level == 'WRONG'
             print(f'{level:<6}{about:<16}{text}', flush=True)
-    print(f'{wrong} of these are wrong' if wrong else 'nothing is wrong')
+    print(f'{wrong} of these {"is" if wrong == 1 else "are"} wrong' if wrong else 'nothing is wrong')
     return int(wrong > 0)
 
 

@@ -390,6 +390,9 @@ def test_compare_refuses_what_cannot_be_compared(result, tmp_path, capsys):
     assert main(['compare', a, blind]) == 1
     assert 'blind has no ground truth' in capsys.readouterr().err
     assert main(['compare', a, str(tmp_path / 'predictions.txt')]) == 1
+    assert 'predictions.txt: there is no such file' in capsys.readouterr().err
+    (tmp_path / 'predictions.txt').touch()
+    assert main(['compare', a, str(tmp_path / 'predictions.txt')]) == 1
     assert 'need --ground-truth and --dataset' in capsys.readouterr().err
     with pytest.raises(SystemExit) as caught:
         main(['compare', a])

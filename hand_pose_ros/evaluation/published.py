@@ -166,6 +166,8 @@ def load_result(source: str, truth: str | Path | None = None, dataset: Dataset |
     name, path = split_source(source)
     if Path(path).suffix == '.npz':
         result = Result.load(path)
+    elif not Path(path).is_file():
+        raise InputError(f'{path}: there is no such file')
     elif truth is None or dataset is None:
         raise InputError(f'{path}: predictions as text need --ground-truth and --dataset')
     else:

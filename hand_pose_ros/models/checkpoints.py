@@ -118,7 +118,8 @@ def _locate(name_or_path: str | PathLike[str]) -> Path:
     if path.is_file():
         return path
     if path.suffix or os.sep in name:
-        raise CheckpointError(f'there is no checkpoint file {path}')
+        raise CheckpointError(f'there is no checkpoint file {path}: give another path, or one of '
+                              f"{', '.join(shipped) or 'none yet'}, which ship")
     raise CheckpointError(f"there is no checkpoint named '{name}': the ones that ship are "
                           f"{', '.join(shipped) or 'none yet'}; or give the path of a .safetensors file")
 

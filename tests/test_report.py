@@ -150,9 +150,14 @@ def test_curves_show_what_the_metrics_say(result):
     for axes, curve in ((left, metrics.success_curve), (right, metrics.pck)):
         line = axes.lines[0]
         assert line.get_ydata() == pytest.approx(100 * curve(result.errors_mm, line.get_xdata()))
+        assert (axes.get_xlim(), axes.get_ylim()) == ((0, 80), (0, 100))
+    assert (left.get_title('left'), left.get_ylabel()) == ('Frames with all joints within', 'frames, %')
+    assert (right.get_title('left'), right.get_ylabel()) == ('Joints within', 'joints, %')
     auc, mean = metrics.auc(result.errors_mm), metrics.mean_mm(result.errors_mm)
     assert legends(plots.curves([result])) == [f' {result.name}   AUC {auc:.3f}, mean {mean:.1f} mm']
-    bars = plots.joint_bars([result, replace(result, predictions=result.truth)]).axes[0].patches
+    (axes,) = plots.joint_bars([result, replace(result, predictions=result.truth)]).axes
+    assert [label.get_text().replace(' ', '_') for label in axes.get_xticklabels()] == list(HAND21.joint_names)
+    bars = axes.patches
     assert [bar.get_height() for bar in bars] == pytest.approx([*metrics.per_joint_mm(result.errors_mm), *[0] * 21])
     assert [bar.get_center()[0] for bar in bars] == pytest.approx([*(np.arange(21) - 0.2), *(np.arange(21) + 0.2)])
 
@@ -164,6 +169,7 @@ def test_errors_and_times_are_drawn_where_they_were(result):
     at, errors = 0.033 * np.arange(40), result.errors_mm
     (axes,) = plots.over_time(parted).axes
     lines = {line.get_label(): line.get_xydata().T for line in axes.lines}
+    assert len({line.get_color() for line in axes.lines[:3]}) == 3, 'mean, worst and missed can be told apart'
     for label, expected in (('mean of joints', metrics.frame_means_mm(errors)), ('worst joint', errors.max(axis=1))):
         np.testing.assert_allclose(lines[label], [at, np.where(np.arange(40) == 7, np.nan, expected)])
     assert lines['missed'][0] == pytest.approx(at[7:8]) and axes.get_ylim()[1] > errors[np.isfinite(errors)].max()
@@ -173,6 +179,26 @@ def test_errors_and_times_are_drawn_where_they_were(result):
     (axes,) = plots.latency(parted).axes
     tops = [area.get_paths()[0].vertices[:, 1].max() for area in axes.collections]
     assert tops == pytest.approx([1000 * seconds['predict'].max()] * 2) and axes.get_xlabel() == 'time, s'
+    assert legends(axes.figure) == ['predict', 'decode'] and axes.get_ylim()[1] > tops[1]
+
+
+def test_the_times_of_a_long_recording_are_drawn_as_means(result):
+    """A bar for each frame would be thinner than a pixel, and the report of an hour would have 80 MB."""
+    seconds = np.random.default_rng(0).exponential(0.01, 18_000)
+    long = replace(result, predictions=np.zeros((18_000, 21, 3)), truth=None, stamps_ns=33_000_000 * np.arange(18_000),
+                   seconds={'read': seconds / 2, 'predict': seconds})
+    figure = plots.latency(long)
+    (axes,) = figure.axes
+    assert len(plots.to_bytes(figure, 'svg')) < 500_000 and axes.get_title('left').endswith('(mean of 23)')
+    means = 1500 * seconds[:17_986].reshape(-1, 23).mean(1)
+    assert axes.collections[1].get_paths()[0].vertices[:, 1].max() == pytest.approx(means.max())
+    assert axes.get_xlim() == pytest.approx((0, 594), abs=1)
+
+
+def test_frames_that_took_no_time_that_is_known_are_drawn(result):
+    with warnings.catch_warnings():
+        warnings.filterwarnings('error', 'Attempting to set')
+        plots.latency(replace(result, seconds={'image to joints': np.full(40, np.nan)}))  # the node answered none
 
 
 def test_labels_scored_as_predictions_are_drawn_at_zero(result):

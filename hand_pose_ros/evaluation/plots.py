@@ -85,7 +85,10 @@ def joint_bars(results: Sequence[Result]) -> Figure:
 
 @matplotlib.rc_context(STYLE)
 def over_time(result: Result) -> Figure:
-    """Mean and worst error of each frame. Missed frames are marked at the bottom, and parts are separated."""
+    """Mean and worst error of each frame, of which some are known. Missed frames are marked at the bottom.
+
+    Parts are separated.
+    """
     errors = result.errors_mm
     means, worst = metrics.frame_means_mm(errors), metrics.worst_joints_mm(errors)
     figure, (axes,) = _figure(10.5, 3.4)
@@ -94,8 +97,7 @@ def over_time(result: Result) -> Figure:
     _band(axes, at, means, COLORS[0], 'mean of joints')
     missed = metrics.missed_frames(errors)
     highest = np.where(np.isfinite(worst), worst, means)  # if a joint was missed, there is only a mean
-    highest = highest[np.isfinite(highest)]
-    top = np.percentile(highest, 99.8) * 1.05 if highest.size else 0
+    top = np.percentile(highest[np.isfinite(highest)], 99.8) * 1.05
     if missed.any():
         axes.plot(at[missed], np.full(missed.sum(), 0.01 * top), '|', color=COLORS[1], ms=9, clip_on=False,
                   label='missed')
@@ -104,23 +106,27 @@ def over_time(result: Result) -> Figure:
         axes.annotate(name, (at[start], 1), xycoords=('data', 'axes fraction'), xytext=(4, -2), fontsize=9,
                       textcoords='offset points', va='top', color='#4a5560')
     axes.set(title='Error over time', xlabel=label, ylabel='error, mm', ylim=(0, top or 1),
-             xlim=(at[0], at[-1]) if at[-1] > at[0] else None)
+             xlim=(at[0], at[-1]))
     axes.legend(fontsize=9, ncols=3, loc='lower right', bbox_to_anchor=(1, 1))
     return figure
 
 
 @matplotlib.rc_context(STYLE)
 def latency(result: Result) -> Figure:
-    """Milliseconds of each stage in each frame, stacked."""
+    """Milliseconds of each stage in each frame, stacked. If there are too many frames, the mean of every few frames."""
     at, label = _time_axis(result)
-    stages = {stage: 1000 * np.nan_to_num(seconds) for stage, seconds in result.seconds.items() if stage != 'total'}
+    group = _group(len(at))
+    title = f'Time of each frame (mean of {group})' if group > 1 else 'Time of each frame'
+    at = _grouped(at, group).mean(1)
+    stages = {stage: 1000 * _grouped(np.nan_to_num(seconds), group).mean(1)
+              for stage, seconds in result.seconds.items() if stage != 'total'}
     if len(at) == 1:
         at, stages = np.array([0.5, 1.5]), {stage: ms.repeat(2) for stage, ms in stages.items()}  # to have a width
     figure, (axes,) = _figure(10.5, 3.2)
     axes.stackplot(at, *stages.values(), labels=list(stages), colors=COLORS, lw=0, step='mid')
     total = np.sum(list(stages.values()), axis=0)
-    axes.set(title='Time of each frame', xlabel=label, ylabel='ms', ylim=(0, np.percentile(total, 99.5) * 1.1 or 1),
-             xlim=(at[0], at[-1]) if at[-1] > at[0] else None)
+    axes.set(title=title, xlabel=label, ylabel='ms', ylim=(0, np.percentile(total, 99.5) * 1.1 or 1),
+             xlim=(at[0], at[-1]))
     axes.legend(fontsize=9, ncols=len(stages), loc='lower right', bbox_to_anchor=(1, 1))
     return figure
 
@@ -165,16 +171,25 @@ def _time_axis(result: Result) -> tuple[NDArray[np.float64], str]:
     return (result.stamps_ns - result.stamps_ns[0]) / 1e9, 'time, s'
 
 
+def _group(frames: int) -> int:
+    """How many frames share a place in a plot, so that there are 800 at most. More would be thinner than a pixel."""
+    return -(-frames // 800)
+
+
+def _grouped(values: NDArray[np.float64], group: int) -> NDArray[np.float64]:
+    """(N,) -> (N // group, group). The frames that fill no group are left out."""
+    return values[:len(values) // group * group].reshape(-1, group)
+
+
 def _band(axes: Axes, at: NDArray[np.float64], values: NDArray[np.float64], color: str, label: str) -> None:
     """A line through the values. If there are too many frames, the range and median of every few frames."""
     values = np.where(np.isfinite(values), values, np.nan)
-    group = -(-len(values) // 800)
+    group = _group(len(values))
     if group == 1:
         axes.plot(at, values, '.-', color=color, lw=1.2, ms=3, label=label)  # dots show single frames
         return
-    cut = len(values) // group * group
-    grouped = np.ma.masked_invalid(values[:cut].reshape(-1, group))
-    middle = at[:cut].reshape(-1, group).mean(1)
+    grouped = np.ma.masked_invalid(_grouped(values, group))
+    middle = _grouped(at, group).mean(1)
     axes.fill_between(middle, grouped.min(1), grouped.max(1), color=color, alpha=0.25, lw=0)
     axes.plot(middle, np.ma.median(grouped, axis=1), '.-', color=color, lw=1, ms=2,
               label=f'{label} (median, range of {group})')

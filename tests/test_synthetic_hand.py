@@ -11,7 +11,7 @@ from hand_pose_ros.errors import InputError
 from hand_pose_ros.skeleton import HAND21
 from hand_pose_ros.synthetic.contact import overlaps
 from hand_pose_ros.synthetic.hand import HandModel
-from hand_pose_ros.synthetic.kinematics import INDEX, POSE, forward
+from hand_pose_ros.synthetic.kinematics import BONES, INDEX, POSE, forward
 from hand_pose_ros.synthetic.poses import LIMITS, sample_poses
 from hand_pose_ros.synthetic.rig import Rig
 from hand_pose_ros.synthetic.rng import Random
@@ -53,6 +53,14 @@ def winding(vertices, faces, points):
     top = (a * torch.linalg.cross(b, c)).sum(-1)
     bottom = la * lb * lc + (a * b).sum(-1) * lc + (b * c).sum(-1) * la + (c * a).sum(-1) * lb
     return 2 * torch.atan2(top, bottom).sum(-1) / (4 * math.pi)
+
+
+def reach(vertices, faces, point, direction):
+    """How far it is from a point inside the mesh (V, 3), (F, 3) to where a ray leaves it."""
+    a, b, c = (vertices[faces[:, i]] - point for i in range(3))
+    inside = torch.stack([torch.linalg.cross(u, v) @ direction for u, v in ((a, b), (b, c), (c, a))]).amin(0) >= 0
+    normal = torch.linalg.cross(b - a, c - a)
+    return ((a * normal).sum(-1) / (normal @ direction))[inside].max().item()
 
 
 def volume(vertices, faces):
@@ -175,6 +183,42 @@ def test_skin_is_as_thick_as_the_measures_say_straight_and_bent(model):
                 assert 0.85 * radius < thickness < 1.2 * radius, (digit, bend)
             knuckle = (skin - b).norm(dim=1).min()
             assert 0.6 * shape.radii[0, digit, 1] < knuckle < 1.2 * shape.radii[0, digit, 1], (digit, bend)
+
+
+def test_the_flesh_is_on_the_side_of_the_palm(model):
+    """How much thicker the hand is between bone and palm than between bone and back, at the least."""
+    shape, angles = mean_shape(), pose(**OPEN)
+    skin, joints = (part[0] for part in model(shape, angles))
+    rotations, origins = (part[0] for part in forward(shape, angles, model.rest)[:2])
+    palmar = {bone: rotation[:, 2] for bone, rotation in zip(BONES, rotations, strict=True)}
+    knuckles = joints[5::4]
+    places = [('wrist', joints[0], palmar['carpus'], 1.1),
+              ('heel below the thumb', torch.tensor([0.020, 0.030, 0]), palmar['carpus'], 3),
+              ('heel below the little finger', torch.tensor([-0.020, 0.025, 0]), palmar['carpus'], 1.7)]
+    for finger, knuckle in zip(FINGERS, knuckles, strict=True):
+        bone = f'{finger}_metacarpal'
+        places += [(bone, (origins[BONES.index(bone)] + knuckle) / 2, palmar[bone], 1.4),
+                   (f'{finger} knuckle', knuckle, palmar[bone], 1.25)]
+    places += [('web', (a + b) / 2, palmar['carpus'], 1.25) for a, b in pairwise(knuckles)]
+    for digit, finger in enumerate(('thumb', *FINGERS)):
+        for i in (1, 2, 3):
+            start, end = joints[4 * digit + i], joints[4 * digit + i + 1]
+            bone = f'{finger}_bone{i}'
+            places.append((bone, (start + end) / 2, palmar[bone], 1.05 if i == 3 else 1.1))
+    for place, point, direction, least in places:
+        palm, back = (reach(skin, model.faces, point, way) for way in (direction, -direction))
+        assert palm > least * back, place
+    assert winding(skin, model.faces, (joints[2] + knuckles[:1]) / 2) > 0.9, 'no web between thumb and index finger'
+
+
+@pytest.mark.parametrize('digit', range(5))
+def test_a_bent_finger_drags_no_other_but_at_the_web(model, digit):
+    still, bent = (model(mean_shape(), pose(**OPEN, **{f'{("thumb", *FINGERS)[digit]}_mcp_flexion': degrees}))[0][0]
+                   for degrees in (0, 60))
+    moved = (bent - still).norm(dim=1)
+    for other in {*range(5)} - {digit}:
+        web = digit * other > 0 and abs(digit - other) == 1
+        assert moved[model.vertex_part == other].max() < (0.012 if web else 0.0002), other
 
 
 def test_no_bend_costs_the_hand_its_flesh(model):

@@ -21,7 +21,10 @@ def test_any_value_of_a_recipe_can_be_replaced():
 
 
 @pytest.mark.parametrize(('override', 'message'), [
-    ('lr=1', "no 'lr'"), ('samples=many', 'not of type'), ('samples=1.5', 'not of type'), ('seed', 'key=value'),
+    ('lr=1', "no 'lr'"), ('seed', 'key=value'), ('seed=none', 'seed=none: give a whole number, for example 23455$'),
+    ('samples=1.5', '--set samples=1.5: give a whole number, or none, for example 1000$'),
+    ('learning_rate=fast', 'give a number, for example 0.01$'), ('train_prior=yes', 'give true or false$'),
+    ('options=8', 'set each value on its own, for example options.bottleneck=8$'),
     ('samples=-5', '--set samples=-5: must be at least 1'), ('batch_size=0', 'at least 1'), ('seed=-1', 'at least 0'),
     ('seed=20261126', 'at most 4194303'), ('learning_rate=-1', r'learning_rate=-1: must be at least 1e-09'),
     ('knee=0', 'at least 1e-06'), ('weight_decay=-1', 'at least 0'), ('warmup=2', 'at most 1'),

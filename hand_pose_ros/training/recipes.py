@@ -184,7 +184,7 @@ def _replace(target: T, keys: list[str], text: str, item: str) -> T:
             raise HandPoseError(f"--set {item}: choose one of {', '.join(PRESETS)}, or one value: {key}.jitter=0.01")
         value = PRESETS[text]
     else:
-        value = _convert(text, fields[key], item)
+        value = _convert(text, fields[key], item, getattr(target, key))
         least, most = _RANGES.get(key, (1, math.inf))
         if type(value) in (int, float) and not least <= value <= most:  # a bool is no number here
             raise HandPoseError(f'--set {item}: must be '
@@ -201,8 +201,8 @@ def _literal(text: str) -> Any:
         return text
 
 
-def _convert(text: str, kind: str, item: str) -> Any:
-    """The value of a text for a field of this annotated type."""
+def _convert(text: str, kind: str, item: str, now: Any) -> Any:
+    """The value of a text for a field of this annotated type, whose value is now another one."""
     value, kinds = _literal(text), [part.split('[')[0] for part in kind.split(' | ')]
     if value is None and 'None' in kinds:
         return None
@@ -214,4 +214,9 @@ def _convert(text: str, kind: str, item: str) -> Any:
         return int(value)
     if type(value).__name__ in kinds:
         return value
-    raise HandPoseError(f"--set {item}: '{text}' is not of type {kind}")
+    if 'dict' in kinds:
+        raise HandPoseError(f'--set {item}: set each value on its own, for example options.bottleneck=8')
+    wanted = 'true or false' if 'bool' in kinds else (
+        f"a {'whole ' * ('int' in kinds)}number{', or none' * ('None' in kinds)}, "
+        f'for example {1000 if now is None else now}')
+    raise HandPoseError(f'--set {item}: give {wanted}')

@@ -189,16 +189,19 @@ def test_the_prior_equals_a_singular_value_decomposition():
 def test_mistakes_are_named():
     with pytest.raises(HandPoseError, match=r'choose one of .*deep'):
         build('deeper')
-    for wrong in ({'blocks': 2}, {'blocks': (1, 'x', 1, 1)}, {'width': 'x'}):
-        with pytest.raises(HandPoseError, match="'hand_dense' cannot be made with"):
-            build('hand_dense', **wrong)
-    with pytest.raises(HandPoseError, match='refined no: give true or false'):  # which is no empty text, so as if true
-        build('hand_dense', refined='no')
-    for architecture in ('hand_dense', 'two_looks', 'hand_finder'):
-        with pytest.raises(HandPoseError, match='width -8: give at least'):
-            build(architecture, width=-8)
-        with pytest.raises(HandPoseError, match='width 0: give at least'):
-            build(architecture, width=0)
+    for name, wrong, wanted in (
+            ('blocks', 2, 'whole numbers, for example 1,1,1,1'), ('blocks', (1, 'x', 1, 1), 'whole numbers'),
+            ('width', 'x', 'a whole number'), ('width', -8, 'at least 1'), ('refined', 'no', 'true or false'),
+            ('bottleneck', 2.5, 'a whole number, or none')):
+        for architecture in ('hand_dense', 'two_looks'):
+            with pytest.raises(HandPoseError, match=f'^{architecture} cannot have {name}=.*: give {wanted}'):
+                build(architecture, **{name: wrong})
+    with pytest.raises(HandPoseError, match=r'dropout=2: give a number from 0 to 1'):
+        build('deep', dropout=2)
+    with pytest.raises(HandPoseError, match='width 1: give at least 2'):
+        build('hand_finder', width=1)
+    with pytest.raises(HandPoseError, match="'resnet' cannot be made with"):
+        build('resnet', channels=[32])
     with pytest.raises(HandPoseError, match='does not take depth: it takes joints'):
         build('deep', depth=3)
     with pytest.raises(HandPoseError, match='without a bottleneck'):

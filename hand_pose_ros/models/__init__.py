@@ -53,11 +53,32 @@ def build(architecture: str, **config: Any) -> nn.Module:
     if unknown := sorted(config.keys() - signature.parameters.keys()):
         raise HandPoseError(f"architecture '{architecture}' does not take {', '.join(unknown)}: "
                             f"it takes {', '.join(signature.parameters)}")
+    for name, value in config.items():
+        if wanted := _wanted(value, signature.parameters[name]):
+            raise HandPoseError(f'{architecture} cannot have {name}={value}: give {wanted}')
     arguments = signature.bind(**config)
     arguments.apply_defaults()  # a checkpoint must not depend on the defaults of the version that reads it
     try:
         network = make(**arguments.arguments)
-    except (TypeError, ValueError, RuntimeError) as error:
+    except (TypeError, ValueError, RuntimeError, IndexError) as error:
         raise HandPoseError(f"architecture '{architecture}' cannot be made with {config}: {error}") from error
     vars(network).update(architecture=architecture, config=dict(arguments.arguments))
     return network
+
+
+def _wanted(value: Any, parameter: inspect.Parameter) -> str:
+    """What to give instead of a value of the wrong type or out of range. It is empty if the value may do."""
+    kind, *none = parameter.annotation.split(' | ')
+    if (value is None and none) or kind.startswith('dict'):
+        return ''
+    if kind == 'bool':  # 'no' would be true
+        return '' if isinstance(value, bool) else 'true or false'
+    if kind not in ('int', 'float'):
+        fits = isinstance(value, list | tuple) and all(type(number) is int for number in value)
+        return '' if fits else f'whole numbers, for example {",".join(map(str, parameter.default))}'
+    if type(value) not in ((int,) if kind == 'int' else (int, float)):
+        return f'a {"whole " * (kind == "int")}number{", or none" * bool(none)}'
+    if kind == 'float':  # dropout
+        return '' if 0 <= value <= 1 else 'a number from 0 to 1'
+    least = min(parameter.default or 0, 1)
+    return '' if value >= least else f'at least {least}'

@@ -87,8 +87,7 @@ class HandDense(nn.Module):
         refined: whether the joints are refined.
 
     Raises:
-        HandPoseError: `blocks` are not four numbers of at least 1, the width is less than 1, or `refined` is neither
-            true nor false.
+        HandPoseError: `blocks` are not four numbers of at least 1.
     """
 
     outputs = ('joints', 'confidence', 'hand', 'side', 'size')
@@ -98,10 +97,6 @@ class HandDense(nn.Module):
         super().__init__()
         if len(blocks) != 4 or min(blocks) < 1:
             raise HandPoseError(f'blocks {list(blocks)}: give four numbers, each at least 1')
-        if width < 1:
-            raise HandPoseError(f'width {width}: give at least 1')
-        if not isinstance(refined, bool):  # 'no' would be true
-            raise HandPoseError(f'refined {refined}: give true or false')
         self.joints, self.width, self.bottleneck, self.blocks, self.refined = (
             joints, width, bottleneck, list(blocks), refined)
         w = width

@@ -99,13 +99,11 @@ def overlay(depth: NDArray[np.float32], intrinsics: Intrinsics, hands: Sequence[
         height: of the picture, pixels.
     """
     width = np.clip(depth.shape[1] * height / depth.shape[0], height / 4, 16 * height)  # one row would be endless
-    whole = _View(depth, intrinsics, (0, 0), (depth.shape[1], depth.shape[0]), (round(width), height))
-    picture = whole.shade()
-    for hand in hands:
-        draw_cube(picture, hand.cube, whole.intrinsics)
-        draw_joints(picture, hand.joints, whole.intrinsics, skeleton)
+    picture, shown = _view(depth, intrinsics, (0, 0), (depth.shape[1], depth.shape[0]), (round(width), height))
     panels = [picture]
     for hand in hands:
+        draw_cube(picture, hand.cube, shown)
+        draw_joints(picture, hand.joints, shown, skeleton)
         panels.append(close_up(depth, intrinsics, hand.cube, hand.joints, skeleton, height))
         caption(panels[-1], f'{hand.side} {hand.score:.2f}')
     if not hands:
@@ -118,10 +116,10 @@ def close_up(depth: NDArray[np.float32], intrinsics: Intrinsics, cube: Cube, joi
     """What is in a cube, enlarged to size x size pixels, with joints (J, 3) in metres."""
     half, z = cube.side / 2, cube.center[2]
     u, v = intrinsics.project(cube.center)
-    reach = (2 * half * intrinsics.fx / z, 2 * half * intrinsics.fy / z)
-    view = _View(depth, intrinsics, (u - reach[0] / 2, v - reach[1] / 2), reach, (size, size))
-    picture = view.shade(z - half, z + half)
-    draw_joints(picture, joints, view.intrinsics, skeleton)
+    width, height = cube.side * intrinsics.fx / z, cube.side * intrinsics.fy / z
+    picture, shown = _view(depth, intrinsics, (u - width / 2, v - height / 2), (width, height), (size, size),
+                           z - half, z + half)
+    draw_joints(picture, joints, shown, skeleton)
     return picture
 
 
@@ -137,25 +135,21 @@ def contact_sheet(pictures: Sequence[Picture], columns: int = 4) -> Picture:
     return sheet
 
 
-class _View:
-    """A rectangle of a depth image at another size, with the intrinsics that belong to it."""
+def _view(depth: NDArray[np.float32], intrinsics: Intrinsics, corner: tuple[float, float], extent: tuple[float, float],
+          size: tuple[int, int], near: float | None = None, far: float | None = None) -> tuple[Picture, Intrinsics]:
+    """A rectangle of a depth image as a lit surface of another size, and the intrinsics that belong to it.
 
-    def __init__(self, depth: NDArray[np.float32], intrinsics: Intrinsics, corner: tuple[float, float],
-                 extent: tuple[float, float], size: tuple[int, int]) -> None:
-        (u, v), (width, height) = corner, size
-        a, b = width / extent[0], height / extent[1]
-        # Pixel centres are integers: the left edge of the image is at -0.5.
-        matrix = np.array([[a, 0, (0.5 - u) * a - 0.5], [0, b, (0.5 - v) * b - 0.5]])
-        self._matrix, self._size = matrix, size
-        self._depth, self._original = depth, intrinsics
-        self.intrinsics = Intrinsics(intrinsics.fx * a, intrinsics.fy * b, intrinsics.cx * a + matrix[0, 2],
-                                     intrinsics.cy * b + matrix[1, 2], width, height)
-
-    def shade(self, near: float | None = None, far: float | None = None) -> Picture:
-        """The shaded surface. It is lit before it is enlarged, because each enlarged pixel would be a terrace."""
-        lit = shade(self._depth, self._original, near, far)
-        return np.asarray(cv2.warpAffine(lit, self._matrix, self._size, flags=cv2.INTER_LINEAR,
-                                         borderValue=_NOTHING), np.uint8)
+    It is lit before it is enlarged, because each enlarged pixel would be a terrace.
+    """
+    (u, v), (width, height) = corner, size
+    a, b = width / extent[0], height / extent[1]
+    # Pixel centres are integers: the left edge of the image is at -0.5.
+    matrix = np.array([[a, 0, (0.5 - u) * a - 0.5], [0, b, (0.5 - v) * b - 0.5]])
+    picture = cv2.warpAffine(shade(depth, intrinsics, near, far), matrix, size, flags=cv2.INTER_LINEAR,
+                             borderValue=_NOTHING)
+    return np.asarray(picture, np.uint8), Intrinsics(
+        intrinsics.fx * a, intrinsics.fy * b, intrinsics.cx * a + matrix[0, 2], intrinsics.cy * b + matrix[1, 2],
+        width, height)
 
 
 _SHIFT = 4  # OpenCV draws at sixteenths of a pixel

@@ -5,7 +5,7 @@ Plain data: `ros.conversions` makes visualization_msgs of it, and `bags.BagWrite
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import combinations, product
 
@@ -69,13 +69,13 @@ class HandMarkers:
     def update(self, hands: Sequence[HandEstimate]) -> list[Marker]:
         """Deletions of the hands that were there before and are not now, and markers of the hands of an image."""
         ids = {hand.id for hand in hands}
-        lost, self._shown = self._shown - ids, ids
-        return [*_deletions(lost), *(marker for hand in hands for marker in self._show(hand))]
+        lost, self._shown = sorted(self._shown - ids), ids
+        return [*(Marker(f'{hand}/{part}', DELETE) for hand in lost for part in PARTS),
+                *(marker for hand in hands for marker in self._show(hand))]
 
     def clear(self) -> list[Marker]:
         """Deletions of everything that is shown."""
-        lost, self._shown = self._shown, set()
-        return _deletions(lost)
+        return self.update(())
 
     def _show(self, hand: HandEstimate) -> tuple[Marker, ...]:
         joints, bones, cube = (f'{hand.id}/{part}' for part in PARTS)
@@ -83,10 +83,6 @@ class HandMarkers:
         return (Marker(joints, ADD, SPHERE_LIST, (JOINT_DIAMETER_M,) * 3, hand.joints, self._joint_colors),
                 Marker(bones, ADD, LINE_LIST, (BONE_WIDTH_M, 0.0, 0.0), hand.joints[self._bones], self._bone_colors),
                 Marker(cube, ADD, LINE_LIST, (CUBE_LINE_M, 0.0, 0.0), corners, (_GREY,) * len(corners)))
-
-
-def _deletions(ids: Collection[str]) -> list[Marker]:
-    return [Marker(f'{hand}/{part}', DELETE) for hand in sorted(ids) for part in PARTS]
 
 
 def _color(rgb: tuple[int, int, int]) -> Color:

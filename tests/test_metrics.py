@@ -148,6 +148,17 @@ def test_bone_drift_of_a_hand_worked_case():
     assert metrics.smoothness(joints, skeleton)['bone_drift_mm'] == pytest.approx(10 / 15)
 
 
+def test_bones_of_different_hands_do_not_drift():
+    skeleton = SKELETONS['icvl16']
+    joints = np.zeros((7, 16, 3))
+    joints[:, 3, 0] = 0.03, 0.05, 0.08, 0.08, NAN, 0.05, 0.2  # thumb tip
+    hands = ['a', 'a', 'b', 'b', 'b', 'a', 'c']  # the third is seen once, which tells no change
+    drift = metrics.bone_drift_mm(joints, skeleton, hands)
+    off = np.array([30, 50, 50]) - 130 / 3
+    assert drift[2] == pytest.approx(np.sqrt((off ** 2).sum() / 5)) and np.delete(drift, 2) == pytest.approx(0)
+    assert metrics.smoothness(joints, skeleton, list('abcdefg'))['bone_drift_mm'] is None, 'no hand is seen twice'
+
+
 def test_fingers_are_averaged_over_their_own_joints():
     errors = np.tile(np.arange(21.0), (3, 1))
     fingers = metrics.per_finger_mm(errors, HAND21)

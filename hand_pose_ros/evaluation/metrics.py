@@ -173,10 +173,26 @@ def bone_lengths_mm(joints: ArrayLike, skeleton: Skeleton) -> Floats:
     return 1000 * np.linalg.norm(joints[:, children] - joints[:, parents], axis=-1)
 
 
-def bone_drift_mm(joints: ArrayLike, skeleton: Skeleton) -> Floats:
-    """Standard deviation (bones,) of the length of each bone over time. It is 0 for a real hand."""
-    lengths = [column[np.isfinite(column)] for column in bone_lengths_mm(joints, skeleton).T]
-    return np.array([column.std() if column.size else np.nan for column in lengths])
+def bone_drift_mm(joints: ArrayLike, skeleton: Skeleton, hands: ArrayLike | None = None) -> Floats:
+    """Standard deviation (bones,) of the length of each bone over time. It is 0 for a real hand.
+
+    With several hands, it is the deviation from the mean of each hand. A bone that no hand has twice has none (NaN).
+
+    Args:
+        joints: (N, J, 3) in metres.
+        hands: (N,) name or number of the hand. None = it is always the same.
+    """
+    lengths = bone_lengths_mm(joints, skeleton)
+    owners = np.unique(np.zeros(len(lengths)) if hands is None else np.asarray(hands), return_inverse=True)[1]
+    drifts = []
+    for bone in lengths.T:
+        found = np.isfinite(bone)
+        values, owner = bone[found], owners[found]
+        number = np.bincount(owner)
+        means = np.bincount(owner, values) / np.maximum(number, 1)
+        off = (values - means[owner])[number[owner] > 1]
+        drifts.append(np.sqrt(np.mean(off ** 2)) if off.size else np.nan)
+    return np.array(drifts)
 
 
 def percentiles(values: ArrayLike) -> dict[str, float]:
@@ -262,7 +278,7 @@ def summarise(predictions: ArrayLike, truth: ArrayLike, skeleton: Skeleton,
 def smoothness(predictions: ArrayLike, skeleton: Skeleton, hands: ArrayLike | None = None) -> dict[str, Any]:
     """The numbers that need no truth. They are `jitter_mm`, and the mean of `bone_drift_mm` over the bones."""
     return finite_or_none({'jitter_mm': jitter_mm(predictions, hands),
-                           'bone_drift_mm': mean_mm(bone_drift_mm(predictions, skeleton))})
+                           'bone_drift_mm': mean_mm(bone_drift_mm(predictions, skeleton, hands))})
 
 
 SMOOTHNESS = ('error_jitter_mm', 'jitter_mm', 'bone_drift_mm')

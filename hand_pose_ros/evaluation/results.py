@@ -41,7 +41,8 @@ class Result:
         notes: what a reader of the numbers must know.
         info: where the result comes from (files, model, device, command).
         in_time: whether each frame follows the one before. If not, jitter and bone drift are None.
-        hand_ids: (N,) str, of the tracked hand. Jitter is that within each hand. None = it is always the same hand.
+        hand_ids: (N,) str, of the tracked hand. Jitter and bone drift are those within each hand. None = it is always
+            the same hand.
     """
 
     name: str
@@ -74,8 +75,6 @@ class Result:
             summary |= self._accuracy(slice(None))
         summary |= {'frames_total': len(self.predictions),
                     'detection_rate': float(np.mean(detected)) if self.predictions.size else None}
-        if self.parts and self.in_time:  # the hands of several subjects are not one hand that changes
-            summary['bone_drift_mm'] = metrics.finite_or_none(self._bone_drift_mm())
         if self.parts and self.truth is not None:
             summary['parts'] = {
                 name: self._accuracy(slice(start, stop)) for name, (start, stop) in self.parts.items()}
@@ -86,21 +85,15 @@ class Result:
                 stage: metrics.percentiles(1000 * seconds) for stage, seconds in self.seconds.items()}
         return summary | {'notes': list(self.notes), **self.info}
 
-    def _bone_drift_mm(self) -> float:
-        """The mean over the bones of their drift within the parts."""
-        rows = [slice(start, stop) for start, stop in self.parts.values()]
-        drifts = np.array([metrics.bone_drift_mm(self.predictions[part], self.skeleton) for part in rows])
-        frames = np.array([[part.stop - part.start] for part in rows]) * np.isfinite(drifts)
-        with np.errstate(invalid='ignore'):
-            return metrics.mean_mm(np.sqrt(np.nansum(frames * drifts ** 2, axis=0) / frames.sum(axis=0)))
-
     def _hands(self) -> NDArray[np.int64]:
-        """(N,) a number that changes with the hand: where another one is tracked, and where another part begins."""
-        change = np.zeros(len(self.predictions), np.bool_)
-        if self.hand_ids is not None:
-            change[1:] = self.hand_ids[1:] != self.hand_ids[:-1]
-        change[[start for start, _ in self.parts.values()]] = True
-        return change.cumsum()
+        """(N,) a number for each hand that was tracked in each part: the parts may show different people."""
+        part = np.zeros(len(self.predictions), np.int64)
+        part[[start for start, _ in self.parts.values()]] = 1
+        part = part.cumsum()
+        if self.hand_ids is None:
+            return part
+        names, hands = np.unique(self.hand_ids, return_inverse=True)
+        return part * len(names) + hands
 
     def _accuracy(self, rows: slice) -> dict[str, Any]:
         assert self.truth is not None

@@ -2,6 +2,7 @@
 
 import importlib.util
 from array import array
+from collections import Counter
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from types import SimpleNamespace
 
@@ -336,12 +337,16 @@ def test_a_complaint_is_repeated_after_a_while_whatever_its_numbers(monkeypatch:
 
 def test_a_report_tells_rates_times_and_the_worst_problem(monkeypatch: pytest.MonkeyPatch) -> None:
     def report(state: str = 'active', **counts: int) -> DiagnosticStatus:
-        statistics.count(**counts)
+        nonlocal now
+        for what in Counter(counts).elements():  # one after the other, as images come
+            statistics.count(**{what: 1})
+        now += 2.0
         return statistics.report('node', state, True, {'model': 'a'})
 
+    now = 3.0
+    monkeypatch.setattr('hand_pose_ros.ros.diagnostics.time', SimpleNamespace(perf_counter=lambda: now))
     statistics = Statistics()
-    clock = SimpleNamespace(perf_counter=lambda: statistics._window.since + 2.0)
-    monkeypatch.setattr('hand_pose_ros.ros.diagnostics.time', clock)
+    assert (report().level, report().message) == (DiagnosticStatus.STALE, 'no images')
     for milliseconds in range(101):
         statistics.time(total=milliseconds / 1000)
     for nanoseconds in (-1, 50_000_000, int(MAX_AGE_S * 1e9)):  # the others are no ages: the clocks differ
@@ -369,6 +374,31 @@ def test_a_report_tells_rates_times_and_the_worst_problem(monkeypatch: pytest.Mo
     assert (last.level, last.message) == (DiagnosticStatus.WARN, 'no readings')
     statistics.failure = 'no such model'
     assert report().level == DiagnosticStatus.ERROR
+
+
+def test_a_camera_with_less_than_an_image_a_second_is_not_stale_between_its_images(
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    def report(*images: float, problem: str = '') -> tuple[bytes, str]:
+        """The report of second `now`, with images that came at these times."""
+        nonlocal now
+        second = now + 1
+        for image_s in images:
+            now = image_s
+            statistics.count(received=1, answered=1)
+            statistics.problem(problem)
+        now = second
+        status = statistics.report('node', 'active', True, {})
+        return status.level, status.message
+
+    now = 0.0
+    monkeypatch.setattr('hand_pose_ros.ros.diagnostics.time', SimpleNamespace(perf_counter=lambda: now))
+    statistics = Statistics()
+    nothing, one = (DiagnosticStatus.STALE, 'no images'), (DiagnosticStatus.OK, '1 images answered, 0 hands')
+    assert [report(), report(1.5), report(), report(3.5), report()] == [nothing, one, one, one, one]
+    warning = DiagnosticStatus.WARN, 'no readings'
+    assert [report(5.5, problem='no readings'), report()] == [warning, warning], 'no news is no good news'
+    assert [report(7.5), report(), report(), report(), report()] == [one, one, one, one, nothing], 'it died'
+    assert [report(12.2, 12.23)[0], report()] == [DiagnosticStatus.OK, nothing], 'a fast one died'
 
 
 class Graph:

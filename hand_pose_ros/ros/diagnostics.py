@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import threading
 import time
@@ -17,6 +18,9 @@ MAX_DROPPED = 0.2
 """If a larger share of images is dropped or lost, there is a warning."""
 MIN_SAMPLE = 10
 """Shares of fewer images than this mean nothing."""
+LATE = 2.0
+"""An image is late after this many times the time between the last two. A slow camera leaves whole seconds without one.
+"""
 REPEAT_S = 30.0
 """The same complaint is logged again after this time."""
 MAX_AGE_S = 10.0
@@ -29,7 +33,7 @@ MAX_KINDS = 100
 class _Window:
     """Counts and times between two reports."""
 
-    since: float = field(default_factory=time.perf_counter)
+    since: float
     counts: Counter[str] = field(default_factory=Counter)
     seconds: defaultdict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     problem: str = ''
@@ -67,16 +71,21 @@ class Statistics:
     def __init__(self) -> None:
         self.failure = self.silence = ''
         self._lock = threading.Lock()
-        self._window = _Window()
+        self._window = _Window(time.perf_counter())
         self._totals: Counter[str] = Counter()
         self._arriving: Counter[str] = Counter()
         self._arrived: Counter[str] = Counter()
+        self._received_at, self._interval = -math.inf, 0.0  # seconds: of the last image, and since the one before it
+        self._told = DiagnosticStatus.STALE, 'no images'  # of the last window with an image
 
     def count(self, **counts: int) -> None:
         """Add to the named counts."""
         with self._lock:
             self._window.counts.update(counts)
             self._totals.update(counts)
+            if counts.get('received'):
+                now = time.perf_counter()
+                self._received_at, self._interval = now, now - self._received_at
 
     def time(self, **seconds: float) -> None:
         """Add a time in seconds to each of the named stages."""
@@ -104,13 +113,18 @@ class Statistics:
             facts: more keys and values.
         """
         with self._lock:
-            window, self._window = self._window, _Window()
+            now = time.perf_counter()
+            window, self._window = self._window, _Window(now)
             totals = dict(self._totals)
-        elapsed = time.perf_counter() - window.since
+            late = now - self._received_at > LATE * self._interval
+        elapsed = now - window.since
         counts = window.counts
         self._count_arrivals(counts if state == 'active' and published else Counter())
-        level, message = ((DiagnosticStatus.ERROR, self.failure) if self.failure
-                          else _judge(window, state, self._arrived, self.silence))
+        quiet = (DiagnosticStatus.STALE, 'no images') if late else self._told
+        judged = _judge(window, state, self._arrived, self.silence, quiet)
+        if counts['received']:
+            self._told = judged
+        level, message = (DiagnosticStatus.ERROR, self.failure) if self.failure else judged
         values = {'state': state, 'input_hz': f'{counts["received"] / elapsed:.1f}',
                   'output_hz': f'{counts["answered"] / elapsed:.1f}'}
         for stage, seconds in window.seconds.items():
@@ -131,8 +145,9 @@ class Statistics:
             self._arrived, self._arriving = self._arriving, Counter()
 
 
-def _judge(window: _Window, state: str, arrived: Counter[str], silence: str) -> tuple[bytes, str]:
-    """Level and message of the worst problem."""
+def _judge(window: _Window, state: str, arrived: Counter[str], silence: str,
+           quiet: tuple[bytes, str]) -> tuple[bytes, str]:
+    """Level and message of the worst problem; `quiet` if there is none, but no image either."""
     counts = window.counts
     if window.problem:
         return DiagnosticStatus.WARN, window.problem
@@ -144,7 +159,7 @@ def _judge(window: _Window, state: str, arrived: Counter[str], silence: str) -> 
         return DiagnosticStatus.WARN, (f'{arrived["camera_infos"]} camera_info but only {arrived["received"]} images '
                                        f'arrived: if there should be as many, {remedy_for_lost_images()}')
     if counts['received'] == 0:
-        return DiagnosticStatus.STALE, 'no images'
+        return quiet
     # Images that wait for their camera_info are reported elsewhere.
     too_many = counts['dropped'] - counts['waited'] > MAX_DROPPED * counts['received']
     if counts['received'] >= MIN_SAMPLE and too_many:

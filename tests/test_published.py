@@ -64,7 +64,11 @@ def test_other_intrinsics_shift_the_mean_as_they_should(shared_data, tmp_path):
 def test_a_file_of_one_sequence_is_matched_to_it_and_says_so(shared_data, capsys):
     folder = shared_data / 'published' / 'icvl'
     whole = load_published(folder / 'DeepPrior.txt.gz', folder / 'groundtruth.txt.gz', ICVL)
-    assert len(whole.predictions) == 702 and 'sequence 1' in whole.notes[0] and '894' in whole.notes[0]
+    assert len(whole.predictions) == 702 and 'sequence 1' in whole.notes[0]
+    assert 'rows 1-702 of groundtruth.txt.gz; the other 894' in whole.notes[0]
+    assert whole.name == 'DeepPrior' and whole.info == {
+        'predictions': str(folder / 'DeepPrior.txt.gz'), 'ground_truth': str(folder / 'groundtruth.txt.gz'),
+        'dataset': 'icvl', 'intrinsics': 'fx 240.99, fy 240.96, cx 160, cy 120'}
     main(['evaluate', '--predictions', str(folder / 'DeepPrior.txt.gz'), '--dataset', 'icvl',
           '--ground-truth', str(folder / 'groundtruth.txt.gz')])
     assert 'NOTE: DeepPrior.txt.gz has 702 frames, as many as sequence 1' in capsys.readouterr().err
@@ -102,7 +106,7 @@ def test_text_files_are_read_in_every_form(tmp_path, uvd, suffix, named):
 
 def test_nan_and_zero_joints_are_missing(tmp_path, uvd):
     broken = uvd.copy()
-    broken[0, 3], broken[1, 0, 0], broken[2], broken[4, 1] = 0, np.nan, np.nan, 0
+    broken[0, 3], broken[1, 0, 0], broken[2], broken[4, 1] = 0, np.inf, np.nan, 0
     uvd[4, 1] = 0  # is not labelled either
     result = load_published(write_uvd(tmp_path / 'p.txt', broken), write_uvd(tmp_path / 'g.txt', uvd), NYU)
     summary = result.summary()
@@ -136,8 +140,10 @@ def test_names_on_both_sides_decide_what_belongs_together(tmp_path, uvd):
     assert backwards.in_time
     with pytest.raises(InputError, match=r"'9\.png' is not in"):
         load_published(write_uvd(tmp_path / 'q.txt', uvd[:1], ['9.png']), truth, NYU)
-    with pytest.raises(InputError, match=r"'1\.png' stands on two lines"):
-        load_published(write_uvd(tmp_path / 'q.txt', uvd[:2], ['1.png'] * 2), truth, NYU)
+    twice = write_uvd(tmp_path / 'q.txt', uvd[:2], ['1.png'] * 2)
+    for both in (twice, truth), (truth, twice):
+        with pytest.raises(InputError, match=r"q\.txt: the file name '1\.png' stands on two lines"):
+            load_published(*both, NYU)
 
 
 @pytest.mark.parametrize(('change', 'message'), [
@@ -162,9 +168,13 @@ def test_wrong_counts_joints_and_units_are_refused(tmp_path, uvd, capsys):
         read_text(truth, ICVL.skeleton)
     with pytest.raises(InputError, match='looks like metres'):
         read_text(write_uvd(tmp_path / 'm.txt', uvd / [1, 1, 1000]), NYU.skeleton)
-    (tmp_path / 'cut.txt.gz').write_bytes(gzip.compress(truth.read_bytes())[:-20])
-    with pytest.raises(InputError, match='cut short'):
-        read_text(tmp_path / 'cut.txt.gz', NYU.skeleton)
+    few = np.where(np.arange(14)[:, None] < 3, uvd, 0)
+    assert read_text(write_uvd(tmp_path / 'few.txt', few), NYU.skeleton).uvd.shape == (5, 14, 3), 'few joints are known'
+    whole = gzip.compress(truth.read_bytes())
+    for damaged in whole[:-20], whole[:40] + b'damage' + whole[46:], b'\x93NUMPY':
+        (tmp_path / 'damaged.txt').write_bytes(damaged)
+        with pytest.raises(InputError, match=r'damaged\.txt: this is not text, or a gzip file that was cut short'):
+            read_text(tmp_path / 'damaged.txt', NYU.skeleton)
     arguments = ['evaluate', '--predictions', str(tmp_path / 'none.txt'), '--ground-truth', str(truth)]
     assert main([*arguments, '--dataset', 'nyu']) == 1
     assert 'none.txt' in capsys.readouterr().err

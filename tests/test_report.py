@@ -18,7 +18,7 @@ from hand_pose_ros.evaluation.published import DATASETS
 from hand_pose_ros.evaluation.report import write_report
 from hand_pose_ros.evaluation.results import Result, named_apart
 from hand_pose_ros.geometry import Intrinsics
-from hand_pose_ros.skeleton import HAND21, get_skeleton
+from hand_pose_ros.skeleton import FINGERS, HAND21, get_skeleton
 from hand_pose_ros.training.figures import runtime
 
 CAMERA = Intrinsics(400, 400, 159.5, 119.5, 320, 240)
@@ -45,11 +45,11 @@ def result():
 
 
 def depth_images(result):
-    """A disc of 4 cm around each true joint, before a wall."""
+    """A disc of 3 cm around each true joint, before a wall."""
     def read(rows):
         images = {}
         for row in rows:
-            image = np.full((240, 320), 1.2, np.float32)
+            image = np.full((240, 320), 0.75, np.float32)
             for (u, v), (_, _, z) in zip(CAMERA.project(result.truth[row]), result.truth[row], strict=True):
                 cv2.circle(image, (round(u), round(v)), 12, float(z), -1)
             images[row] = image
@@ -64,7 +64,7 @@ def test_report_is_one_file_that_needs_nothing_else(result, tmp_path):
     assert not re.search(r'https?://|<link|@import|url\(|src="(?!data:)', outside)
     assert '<odd>' not in html and '<&>' not in html, 'what users name is escaped'
     summary = result.summary()
-    assert 'On the depth image' in html
+    assert 'The truth is dashed' in html and '<th>mm, % of frames</th>' in html
     assert f'{summary["mean_mm"]:.3f}' in html and f'{100 * summary["within_mm"]["20"]:.2f}' in html
     assert {file.name for file in path.parent.iterdir()} == {'report.html', *(
         f'{name}.{form}' for name in ('curves', 'joints', 'errors', 'latency') for form in ('png', 'svg'))}
@@ -77,7 +77,10 @@ def test_report_is_one_file_that_needs_nothing_else(result, tmp_path):
         'area under the curve': f'{summary["auc_0_80"]:.3f}', 'hands found': '97.5 %', 'frames per second': '321',
         'latency, 99th percentile': f'{total["p99"]:.1f} ms', 'jitter': f'{summary["error_jitter_mm"]:.1f} mm'}
     cells = [f'{predict[key]:.2f}' for key in ('mean', 'p50', 'p90', 'p99', 'max')]
-    for row in (['predict', *cells, f'{100 * predict["mean"] / total["mean"]:.0f} %'], ['model', 'm']):
+    fingers = [f'{mean:.1f}' for mean in metrics.per_finger_mm(result.errors_mm, HAND21).values()]
+    assert ''.join(f'<th>{name}</th>' for name in ('mean error, mm', *FINGERS, 'palm')) in html
+    for row in (['predict', *cells, f'{100 * predict["mean"] / total["mean"]:.0f} %'], ['model', 'm'],
+                ['ours &lt;&amp;&gt; others', *fingers]):
         assert ''.join(f'<td>{cell}</td>' for cell in row) in html.replace(' class="text"', '')
 
 
@@ -92,16 +95,22 @@ def test_report_shows_the_best_median_and_worst_frame(result, tmp_path):
     assert len(views) == 3 and all(len(view['cloud']) > 600 and len(view['estimate']) == 21 for view in views)
     assert all(np.mean(view['truth'], axis=0) == pytest.approx(0, abs=0.1) for view in views), 'the truth in the middle'
     assert all(max(map(abs, view['cloud'])) <= 150 and len(view['cloud']) < 3 * 5000 for view in views), 'of the hand'
+    assert re.findall(r'data-view="(\d+)"', html) == ['0', '1', '2']
+    for view in views:
+        cloud = np.reshape(view['cloud'], (-1, 1, 3))
+        assert np.linalg.norm(cloud - view['truth'], axis=-1).min(axis=0).max() < 5, 'the surface is at the joints'
     gap = np.linalg.norm(np.subtract(views[2]['estimate'], views[2]['truth']), axis=1).mean()
     assert gap == pytest.approx(means[order[-1]], abs=0.1), 'the view has the scale of the world'
 
 
 def test_report_without_truth_shows_times_and_first_middle_last(result, tmp_path):
-    blind = Result('b', HAND21, CAMERA, result.predictions, stamps_ns=result.stamps_ns, seconds=result.seconds)
+    blind = Result('b', HAND21, CAMERA, result.predictions, stamps_ns=result.stamps_ns, seconds=result.seconds,
+                   hand_ids=np.repeat(['hand_1', 'hand_2'], 20))
     html = write_report([blind], tmp_path).read_text()
     assert re.findall(r'<h3>(\w+): frame (\d+)</h3>', html) == [('First', '1'), ('Middle', '21'), ('Last', '40')]
-    assert 'Accuracy' not in html and 'On the depth image' not in html
-    assert list(tiles(html)) == ['hands found', 'latency, 99th percentile', 'jitter']
+    assert 'Accuracy' not in html and 'The truth is dashed' not in html
+    assert list(tiles(html)) == ['hands found', 'tracks', 'latency, 99th percentile', 'jitter']
+    assert tiles(html)['tracks'] == '2'
     assert tiles(html)['jitter'] == f'{blind.summary()["jitter_mm"]:.1f} mm'
     live = replace(blind, seconds={'image to joints': blind.seconds['total']})  # the node tells no stages
     assert 'latency, 99th percentile' in tiles(write_report([live], tmp_path).read_text())
@@ -111,6 +120,7 @@ def test_notes_of_all_results_are_told(result, tmp_path):
     one, other = (replace(result, name=name, notes=(f'what to know of {name}',)) for name in ('one', 'other'))
     html = write_report([replace(one, info={'dataset': 'nyu'}), other], tmp_path).read_text()
     assert all(f'<td>{name}</td><td>{mean:g}</td>' in html for name, mean in DATASETS['nyu'].published)
+    assert write_report([one, replace(other, truth=None)], tmp_path).read_text().count('<td>other</td>') == 0
     assert 'one: what to know of one' in html and 'other: what to know of other' in html
 
 
@@ -140,7 +150,8 @@ def test_bones_of_two_hands_are_not_one_hand_that_changes(result):
 
 
 def test_report_of_nothing_found_can_be_written(result, tmp_path):
-    nothing = Result('n', HAND21, CAMERA, np.full((3, 21, 3), np.nan), result.truth[:3])
+    nothing = Result('n', HAND21, CAMERA, np.full((3, 21, 3), np.nan), result.truth[:3],
+                     seconds={'predict': np.full(3, np.nan), 'total': np.full(3, 0.001)})
     page = write_report([nothing], tmp_path).read_text()
     assert '<canvas data-view' not in page and '<td>nan</td>' not in page
     assert legends(plots.curves([nothing])) == [' n   AUC 0.000, mean -']
@@ -155,6 +166,7 @@ def test_curves_show_what_the_metrics_say(result):
     assert (left.get_title('left'), left.get_ylabel()) == ('Frames with all joints within', 'frames, %')
     assert (right.get_title('left'), right.get_ylabel()) == ('Joints within', 'joints, %')
     auc, mean = metrics.auc(result.errors_mm), metrics.mean_mm(result.errors_mm)
+    assert len({plots.to_bytes(plots.curves([result]), 'svg') for _ in range(2)}) == 1, 'so that git sees no change'
     assert legends(plots.curves([result])) == [f' {result.name}   AUC {auc:.3f}, mean {mean:.1f} mm']
     (axes,) = plots.joint_bars([result, replace(result, predictions=result.truth)]).axes
     assert [label.get_text().replace(' ', '_') for label in axes.get_xticklabels()] == list(HAND21.joint_names)

@@ -297,7 +297,7 @@ def print_summaries(summaries: Iterable[tuple[str, dict[str, Any]]]) -> None:
     summaries = list(summaries)
     rows = [row for name, summary in summaries if 'mean_mm' in summary for row in accuracy_rows(name, summary)]
     if rows:
-        print(text_table(('mm, % of frames', *ACCURACY_COLUMNS), rows))
+        print(text_table(ACCURACY_COLUMNS, rows))
     for name, summary in summaries:
         if 'latency_ms' not in summary:
             continue

@@ -69,7 +69,6 @@ def write_report(results: Sequence[Result], folder: str | Path, read_depths: Rea
     for name, figure in figures.items():
         plots.save(figure, folder / name)
     cards = _cards(result, read_depths)
-    on_images = 'On the depth image: the estimate and, where it is known, the truth. ' if read_depths else ''
     sections = [
         _section('Notes', ''.join(f'<p>{escape(note)}</p>' for note in notes), 'notes') if notes else '',
         _tiles(summary),
@@ -80,8 +79,8 @@ def write_report(results: Sequence[Result], folder: str | Path, read_depths: Rea
             ('joints', 'Which joints are hard', _fingers(scored)),
             ('errors', 'When it errs', ''),
             ('latency', 'What a frame costs', _latency(summary))) if name in figures),
-        _section('Frames', f'<p class="soft">{on_images}In 3D (drag to turn, wheel to zoom, double-click to go back) '
-                 'the truth is dashed.</p><div class="frames">'
+        _section('Frames', '<p class="soft">Drag a 3D view to turn it, turn the wheel to zoom, double-click to go back.'
+                 + (' The truth is dashed.' if result.truth is not None else '') + '</p><div class="frames">'
                  + ''.join(card.html for card in cards) + '</div>') if cards else '',
         _section('Where this comes from', _table(
             ('', ''), sorted((key, str(value)) for key, value in result.info.items()), text=True)),
@@ -90,9 +89,10 @@ def write_report(results: Sequence[Result], folder: str | Path, read_depths: Rea
     ]
     template = Template(files(__package__).joinpath('report.html').read_text('utf-8'))
     html = template.substitute(
-        title=escape(result.name), body='\n'.join(sections), frames=_script_json({
+        title=escape(result.name), body='\n'.join(sections), frames=json.dumps({
             'bones': result.skeleton.bones, 'views': [card.view for card in cards],
-            'colors': ['rgb({},{},{})'.format(*FINGER_COLORS[finger]) for finger in result.skeleton.fingers]}),
+            'colors': ['rgb({},{},{})'.format(*FINGER_COLORS[finger]) for finger in result.skeleton.fingers]},
+            allow_nan=False, separators=(',', ':')),
         subtitle=f'{summary["frames_total"]} frames, {result.skeleton.name}, hand_pose_ros {__version__}')
     path = folder / 'report.html'
     write_bytes(path, html.encode(errors='replace'))  # names of files may not be UTF-8
@@ -198,7 +198,7 @@ def _tiles(summary: dict[str, Any]) -> str:
 
 
 def _accuracy(scored: Sequence[Result]) -> str:
-    return _table(('', *ACCURACY_COLUMNS), [row for r in scored for row in accuracy_rows(r.name, r.summary())])
+    return _table(ACCURACY_COLUMNS, [row for r in scored for row in accuracy_rows(r.name, r.summary())])
 
 
 def _fingers(scored: Sequence[Result]) -> str:
@@ -235,8 +235,3 @@ def _section(title: str, content: str, kind: str = '') -> str:
 
 def _data_image(kind: str, data: bytes, alternative: str) -> str:
     return f'<img src="data:image/{kind};base64,{b64encode(data).decode()}" alt="{escape(alternative)}">'
-
-
-def _script_json(value: Any) -> str:
-    """JSON that cannot end the script element around it."""
-    return json.dumps(value, allow_nan=False, separators=(',', ':')).replace('<', '\\u003c')

@@ -6,15 +6,12 @@ from collections.abc import Sequence
 from math import isnan
 from typing import Any
 
-ACCURACY_COLUMNS = ('frames', 'missed', 'mean', 'median', 'max', '<=20', '<=30', '<=40', '<=50', '<=80 mm', 'AUC',
-                    'translation', 'rigid', 'jitter', 'bone drift')
+ACCURACY_COLUMNS = ('mm, % of frames', 'frames', 'missed', 'mean', 'median', 'max', '<=20', '<=30', '<=40', '<=50',
+                    '<=80 mm', 'AUC', 'translation', 'rigid', 'jitter', 'bone drift')
 
 
 def accuracy_rows(name: str, summary: dict[str, Any]) -> list[tuple[str, ...]]:
-    """A row for a summary with truth, and a row for each of its parts. A row is a name and the ACCURACY_COLUMNS.
-
-    Numbers are in millimetres, and in per cent of frames.
-    """
+    """A row for a summary with truth, and a row for each of its parts, with the ACCURACY_COLUMNS."""
     parts = summary.get('parts', {}).items()
     return [(name, *_accuracy_cells(summary)), *((f'- {part}', *_accuracy_cells(its)) for part, its in parts)]
 

@@ -4,18 +4,21 @@ import os
 import shutil
 import subprocess
 import sys
+from itertools import count
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
 from hand_pose_ros.bags import Bag, BagWriter, read_hands
-from hand_pose_ros.cli import main
+from hand_pose_ros.cli import estimate, main
 from hand_pose_ros.drawing import FINGER_COLORS
+from hand_pose_ros.errors import InputError
 from hand_pose_ros.estimator import HandPoseEstimator
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.markers import ADD, DELETE, LINE_LIST, SPHERE_LIST
-from hand_pose_ros.skeleton import HAND21
+from hand_pose_ros.skeleton import FINGERS, HAND21
 
 CAMERA = Intrinsics(140.0, 140.0, 80.0, 60.0, 160, 120)
 INTRINSICS = ['--intrinsics', '140', '140', '80', '60']
@@ -91,6 +94,9 @@ def test_a_folder_of_pngs_into_arrays_and_pictures(tmp_path, folder, command, ex
     assert result['side'].tolist() == [hand.side for hand in hands] and set(result['id']) == {'hand_1'}
     assert tuple(result['joint_names']) == HAND21.joint_names and str(result['skeleton']) == 'hand21'
     assert sorted(path.stem for path in (tmp_path / 'pictures').iterdir()) == sorted(result['names'])
+    for name in result['names']:
+        picture = cv2.imread(str(tmp_path / 'pictures' / f'{name}.png'))
+        assert any((picture == FINGER_COLORS[finger][::-1]).all(-1).any() for finger in FINGERS), 'joints are drawn'
     said = capsys.readouterr().out
     assert '6 images, 6 with a hand, 0 that could not be used' in said
     assert f'wrote {tmp_path / "joints.npz"} and {tmp_path / "pictures"}' in said
@@ -201,10 +207,14 @@ def test_images_without_a_hand_are_answered_too(tmp_path, bag, weights, capsys):
 
 def test_a_bad_file_is_reported_and_the_rest_goes_on(tmp_path, folder, command, capsys):
     cv2.imwrite(str(folder / '9.png'), np.zeros((120, 160), np.uint8))
+    (folder / '11.png').write_text('no picture')
+    cv2.imwrite(str(folder / '12.png'), np.full((120, 160), 3000, np.uint16))  # no hand
     assert command(folder, *INTRINSICS, '--out', tmp_path / 'joints.npz') == 1
-    assert np.load(tmp_path / 'joints.npz')['names'].tolist() == ['8', '10', '11', '12', '13']
+    assert np.load(tmp_path / 'joints.npz')['names'].tolist() == ['8', '10', '12', '13']
     said = capsys.readouterr()
-    assert '9.png: the PNG has 8 bits' in said.err and '1 that could not be used' in said.out
+    assert '9.png: the PNG has 8 bits' in said.err and '11.png: ' in said.err
+    assert '4 images, 3 with a hand, 2 that could not be used' in said.out
+    assert 'nothing had a score' not in said.err and 'of the depth is' not in said.err, 'there are hands'
 
 
 def test_what_comes_before_the_damage_of_a_bag_counts(tmp_path, bag, command, capsys):
@@ -226,6 +236,11 @@ def test_the_folder_of_a_bag_may_lack_its_metadata(tmp_path, bag, command, capsy
     (tmp_path / 'empty').mkdir()
     assert command(tmp_path / 'empty', '--out', tmp_path / 'never.npz') == 1
     assert 'neither 16-bit depth .png files nor a bag' in capsys.readouterr().err
+    for name in 'metadata.yaml', 'recording_0.db3':  # also what is damaged is a bag
+        (damaged := tmp_path / f'with {name}').mkdir()
+        (damaged / name).write_text('x')
+        assert command(damaged, '--out', tmp_path / 'never.npz') == 1
+        assert f'{damaged}: the bag cannot be opened' in capsys.readouterr().err
 
 
 def test_nothing_usable_writes_nothing(tmp_path, command, capsys):
@@ -257,6 +272,24 @@ def test_what_is_wrong_with_every_image_is_said_once(tmp_path, command, capsys):
     assert said.count('those of no camera') == 1 and f'none of the images ({len(STAMPS)})' in said
 
 
+def test_another_problem_is_said_once_too(capsys):
+    def image(problem):
+        def load():
+            raise InputError(problem)
+        return estimate.DepthInput('', 0, '', 0, load)
+
+    problems = ['one'] * 3 + ['other'] * 3
+    with pytest.raises(InputError, match=r'none of the images \(6\)'):
+        estimate.estimate(map(image, problems), len(problems), None, [])
+    assert capsys.readouterr().err == 'hand-pose estimate: one\nhand-pose estimate: other\n'
+
+
+def test_the_time_of_the_median_image_is_told(bag, tmp_path, command, capsys, monkeypatch):
+    monkeypatch.setattr(estimate, 'time', SimpleNamespace(perf_counter=count(0, 0.25).__next__))
+    assert command(bag, '--out', tmp_path / 'joints.npz') == 0
+    assert '; 250.0 ms for the median image' in capsys.readouterr().out
+
+
 def test_intrinsics_that_cannot_be_are_refused_at_once(folder, tmp_path, command, capsys):
     assert command(folder, '--intrinsics', 0, 140, 80, 60, '--out', tmp_path / 'joints.npz') == 1
     said = capsys.readouterr().err
@@ -269,10 +302,11 @@ def test_where_nothing_can_be_written_is_said(tmp_path, folder, command, capsys)
     assert f'{tmp_path / "file"}: File exists, and a folder is needed: give another name' in capsys.readouterr().err
 
 
-@pytest.mark.parametrize('name', ['missing.mcap', 'missing.png', '.'])
+@pytest.mark.parametrize('name', ['missing.mcap', 'missing.png', 'missing'])
 def test_a_missing_input_exits_with_1_and_names_it(tmp_path, command, capsys, name):
-    assert command(tmp_path / name, *INTRINSICS, '--out', tmp_path / 'joints.npz') == 1
-    assert str(tmp_path / name) in capsys.readouterr().err
+    assert command(tmp_path / name, '--overlay', tmp_path / 'pictures') == 1
+    assert f'{tmp_path / name}: there is no such bag, PNG or folder' in capsys.readouterr().err
+    assert not (tmp_path / 'pictures').exists()
 
 
 def test_the_wrong_unit_of_depth_is_named(tmp_path, folder, command, capsys):

@@ -20,6 +20,11 @@ class TrainingError(HandPoseError):
     """Training cannot start or go on."""
 
 
+def counted(number: int, things: str) -> str:
+    """'1 image' or '2 images', for messages."""
+    return f'{number} {things if number != 1 else things.removesuffix("s")}'
+
+
 @contextmanager
 def naming(source: object) -> Iterator[None]:
     """Begin the message of an InputError with the topic or file that it is about, unless `source` is empty."""

@@ -304,7 +304,7 @@ def test_real_bags_without_camera_info_need_intrinsics(shared_data, model, capsy
         assert main(arguments(bag, model)) == 1
         assert 'CameraInfo' in capsys.readouterr().err
         assert main(arguments(bag, model, '--intrinsics', 210, 210, 212, 120)) == 0
-        assert 'raw: 1 frames' in capsys.readouterr().out.replace(name, 'raw')
+        assert 'raw: 1 frame, ' in capsys.readouterr().out.replace(name, 'raw')
 
 
 def test_many_bags_at_once_and_one_that_fails(tmp_path, bag, model, settings, capsys):

@@ -190,5 +190,5 @@ def test_bootstrap_in_blocks_is_wider_where_neighbours_err_alike():
 def test_bootstrap_leaves_out_frames_that_one_side_lacks():
     a, b = np.array([1.0, NAN, 3, 5, 2]), np.array([0.0, 9, 1, INF, 1])
     assert metrics.paired_bootstrap(a, b)[0] == pytest.approx((1 + 2 + 1) / 3)
-    with pytest.raises(InputError, match='1 frames were predicted by both'):
+    with pytest.raises(InputError, match='both predicted 1 frame: at least 2'):
         metrics.paired_bootstrap(a[:2], b[:2])

@@ -524,7 +524,7 @@ def test_command_line_shows_writes_and_measures(tmp_path, capsys, shared_data):
     picture = cv2.imread(str(sheet))
     assert picture is not None and picture.std() > 20
     assert main(['synth', 'show', str(tmp_path / 'new' / 'sheet.png'), '--number', '1']) == 0
-    assert (tmp_path / 'new' / 'sheet.png').exists()
+    assert (tmp_path / 'new' / 'sheet.png').exists() and capsys.readouterr().out.endswith(': 1 picture\n')
     two, second, clean, joints = (tmp_path / f'{name}.png' for name in ('two', 'second', 'clean', 'joints'))
     for file, *options in ((two, '--number', '2'), (second, '--start', '1', '--number', '1'),
                            (clean, '--number', '2', '--clean'), (joints, '--number', '2', '--joints')):

@@ -16,7 +16,7 @@ from rosbags.interfaces import Connection
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from hand_pose_ros.errors import InputError
+from hand_pose_ros.errors import InputError, counted
 from hand_pose_ros.resources import resource
 
 IMAGE, COMPRESSED_IMAGE = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
@@ -71,11 +71,11 @@ class Bag:
                 count += 1
         except Exception as error:  # sqlite and the decompressors raise errors of their own
             self._check_open()
-            raise InputError(f'{self.path}: the bag is damaged after {count} messages ({_said(error)}); '
+            raise InputError(f'{self.path}: the bag is damaged after {counted(count, "messages")} ({_said(error)}); '
                              f'{_remedy(self.path)}') from error
         if self._interrupted:
-            raise InputError(f'{self.path}: the bag was cut short after {count} messages, as by an interrupted '
-                             f'recording or copy; {_remedy(self.path)}')
+            raise InputError(f'{self.path}: the bag was cut short after {counted(count, "messages")}, as by an '
+                             f'interrupted recording or copy; {_remedy(self.path)}')
 
     def first(self, connection: Connection) -> Any:
         """The first message of a connection; None if it has none.

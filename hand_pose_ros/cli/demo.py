@@ -14,7 +14,7 @@ import numpy as np
 
 from hand_pose_ros.bags import DepthBag, RecordedHands, read_hands
 from hand_pose_ros.drawing import Picture, contact_sheet, overlay
-from hand_pose_ros.errors import InputError
+from hand_pose_ros.errors import InputError, counted
 from hand_pose_ros.files import in_one_step, write_bytes, write_json
 from hand_pose_ros.hand import HandEstimate
 from hand_pose_ros.resources import resource
@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     parameters = {'model': args.model} if args.model else {}
     with DepthBag(path) as bag:
         what = '' if args.bag else ' (a synthetic hand)'
-        print(f'playing {len(bag)} depth images of {path}{what} through the node ...', flush=True)
+        print(f'playing {counted(len(bag), "depth images")} of {path}{what} through the node ...', flush=True)
         answers = play_through_node(bag, parameters=parameters, patient=True)
         skeleton = get_skeleton(answers.skeleton)
         hands = {stamp: [hand_from_msg(hand, skeleton) for hand in answer.hands]

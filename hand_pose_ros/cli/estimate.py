@@ -31,7 +31,7 @@ from hand_pose_ros.cli.arguments import (
 from hand_pose_ros.cli.hand_bag import HandBag
 from hand_pose_ros.depth import depth_problem, read_png
 from hand_pose_ros.drawing import overlay
-from hand_pose_ros.errors import InputError
+from hand_pose_ros.errors import InputError, counted
 from hand_pose_ros.files import check_writable, in_one_step, write_bytes
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.hand import HandEstimate
@@ -146,7 +146,7 @@ def estimate(images: Iterator[DepthInput], number: int, estimator: HandPoseEstim
         raise InputError(f'none of the images ({failed}) could be used, so nothing was written')
     for sink in sinks:
         sink.finish()
-    print(f'{done} image{"s" if done > 1 else ""}, {found} with a hand, {failed} that could not be used; '
+    print(f'{counted(done, "images")}, {found} with a hand, {failed} that could not be used; '
           f'{1000 * float(np.median(seconds)):.1f} ms for the median image')
     if not found:
         hint = (f'nothing had a score of {estimator.min_score:g} or more, which networks with little training do not '

@@ -26,7 +26,7 @@ from hand_pose_ros.cli.arguments import (
     keep_input,
     refuse,
 )
-from hand_pose_ros.errors import HandPoseError, InputError
+from hand_pose_ros.errors import HandPoseError, InputError, counted
 from hand_pose_ros.evaluation import published
 from hand_pose_ros.evaluation.results import Result, named_apart, split_source, told_notes
 from hand_pose_ros.evaluation.tables import ACCURACY_COLUMNS, accuracy_rows, number, text_table
@@ -250,7 +250,8 @@ def _run_bags(args: argparse.Namespace) -> int:
             write_json(args.json, {'bags': {bag: summaries[bag] for bag in args.bags if bag in summaries}})
     failed = [bag for bag, summary in summaries.items() if 'error' in summary or summary['damaged']]
     if failed:
-        print(f'\n{len(failed)} of {len(summaries)} bags failed or are damaged: {", ".join(failed)}', file=sys.stderr)
+        print(f'\n{len(failed)} of {len(summaries)} bags failed or {"is" if len(failed) == 1 else "are"} damaged: '
+              + ', '.join(failed), file=sys.stderr)
     return int(bool(failed))
 
 
@@ -301,8 +302,8 @@ def print_summaries(summaries: Iterable[tuple[str, dict[str, Any]]]) -> None:
     for name, summary in summaries:
         if 'latency_ms' not in summary:
             continue
-        line = (f'{name}: {summary["frames_total"]} frames, {number(summary["detection_rate"], 1, " %", 100)} with a '
-                f'hand, {_tracks(summary)}{_pace(summary)}')
+        line = (f'{name}: {counted(summary["frames_total"], "frames")}, '
+                f'{number(summary["detection_rate"], 1, " %", 100)} with a hand, {_tracks(summary)}{_pace(summary)}')
         if 'mean_mm' not in summary:  # with truth, the table says more
             line += (f', jitter {number(summary["jitter_mm"], 2, " mm")}, '
                      f'bone drift {number(summary["bone_drift_mm"], 2, " mm")}')
@@ -315,7 +316,7 @@ def print_summaries(summaries: Iterable[tuple[str, dict[str, Any]]]) -> None:
 def _tracks(summary: dict[str, Any]) -> str:
     if 'tracks' not in summary:  # a file that an earlier version wrote
         return ''
-    return f'{summary["tracks"]} track{"s" * (summary["tracks"] != 1)}, '
+    return f'{counted(summary["tracks"], "tracks")}, '
 
 
 def _pace(summary: dict[str, Any]) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hand_pose_ros.cli.arguments import count, none_or_more
-from hand_pose_ros.errors import HandPoseError
+from hand_pose_ros.errors import HandPoseError, counted
 
 if TYPE_CHECKING:
     import numpy as np
@@ -133,7 +133,7 @@ def _show(args: argparse.Namespace) -> None:
             pictures.append(picture)
     sheet = contact_sheet(pictures, columns)
     write_bytes(args.out, cv2.imencode(args.out.suffix, sheet)[1].tobytes())
-    print(f'{args.out}: {len(pictures)} pictures')
+    print(f'{args.out}: {counted(len(pictures), "pictures")}')
 
 
 def _relief(patch: NDArray[np.float32], label: str) -> Picture:
@@ -203,7 +203,7 @@ def _record(args: argparse.Namespace) -> None:
                                  Cube.at(middle, 0.3), 'truth')
             bag.write_depth(stamp, frame, depth, camera, codec=None if args.raw else 'png')
             bag.write_hands(stamp, frame, [truth], topic='/truth/joints')
-    print(f'{args.out}: {args.number} images')
+    print(f'{args.out}: {counted(args.number, "images")}')
 
 
 def _stats(args: argparse.Namespace) -> None:

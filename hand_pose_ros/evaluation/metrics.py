@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hand_pose_ros.errors import InputError
+from hand_pose_ros.errors import InputError, counted
 from hand_pose_ros.skeleton import FINGERS, Skeleton
 
 Floats = NDArray[np.float64]
@@ -229,7 +229,7 @@ def paired_bootstrap(a_mm: ArrayLike, b_mm: ArrayLike, *, block: int = 30, resam
     difference = a[both] - b[both]
     n = len(difference)
     if n < 2:
-        raise InputError(f'{n} frames were predicted by both: at least 2 are needed to compare them')
+        raise InputError(f'both predicted {counted(n, "frames")}: at least 2 are needed to compare them')
     block = max(1, min(block, n // 2))
     sums = np.concatenate([[0], np.cumsum(np.concatenate([difference, difference[:block]]))])
     block_means = (sums[block:block + n] - sums[:n]) / block

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from hand_pose_ros import __version__
 from hand_pose_ros.drawing import FINGER_COLORS, caption, close_up
+from hand_pose_ros.errors import counted
 from hand_pose_ros.evaluation import metrics, plots
 from hand_pose_ros.evaluation.published import DATASETS
 from hand_pose_ros.evaluation.results import Result, told_notes
@@ -93,7 +94,7 @@ def write_report(results: Sequence[Result], folder: str | Path, read_depths: Rea
             'bones': result.skeleton.bones, 'views': [card.view for card in cards],
             'colors': ['rgb({},{},{})'.format(*FINGER_COLORS[finger]) for finger in result.skeleton.fingers]},
             allow_nan=False, separators=(',', ':')),
-        subtitle=f'{summary["frames_total"]} frames, {result.skeleton.name}, hand_pose_ros {__version__}')
+        subtitle=f'{counted(summary["frames_total"], "frames")}, {result.skeleton.name}, hand_pose_ros {__version__}')
     path = folder / 'report.html'
     write_bytes(path, html.encode(errors='replace'))  # names of files may not be UTF-8
     return path

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
+from hand_pose_ros.errors import counted
 from hand_pose_ros.ros.topics import remedy_for_lost_images
 
 MAX_DROPPED = 0.2
@@ -156,8 +157,9 @@ def _judge(window: _Window, state: str, arrived: Counter[str], silence: str,
     if silence:  # it says more than that images are missing
         return DiagnosticStatus.STALE, silence
     if arrived['received'] < (1 - MAX_DROPPED) * arrived['camera_infos']:
-        return DiagnosticStatus.WARN, (f'{arrived["camera_infos"]} camera_info but only {arrived["received"]} images '
-                                       f'arrived: if there should be as many, {remedy_for_lost_images()}')
+        return DiagnosticStatus.WARN, (f'{arrived["camera_infos"]} camera_info but only '
+                                       f'{counted(arrived["received"], "images")} arrived: if there should be as many, '
+                                       + remedy_for_lost_images())
     if counts['received'] == 0:
         return quiet
     # Images that wait for their camera_info are reported elsewhere.
@@ -165,4 +167,4 @@ def _judge(window: _Window, state: str, arrived: Counter[str], silence: str,
     if counts['received'] >= MIN_SAMPLE and too_many:
         return DiagnosticStatus.WARN, (f'{counts["dropped"]} of {counts["received"]} images of a second were dropped: '
                                        'this machine is too slow, or too busy, for their rate')
-    return DiagnosticStatus.OK, f'{counts["answered"]} images answered, {counts["hands"]} hands'
+    return DiagnosticStatus.OK, f'{counted(counts["answered"], "images")} answered, {counted(counts["hands"], "hands")}'

@@ -252,6 +252,20 @@ def test_errors_over_time_show_labels_of_some_images_only(result, frames):
     assert (np.abs(plot.astype(int) - [178, 114, 0]).max(-1) < 40).sum() > 100
 
 
+def test_errors_of_a_long_recording_are_drawn_as_median_and_range(result):
+    errors = np.random.default_rng(0).uniform(0, 50, 2000)
+    truth = np.broadcast_to(result.truth[0], (2000, 21, 3))
+    predictions = truth + errors[:, None, None] / 1000 * [1, 0, 0]
+    long = replace(result, predictions=predictions, truth=truth, stamps_ns=33_000_000 * np.arange(2000))
+    (axes,) = plots.over_time(long).axes
+    assert legends(axes.figure) == [f'{name} (median, range of 3)' for name in ('worst joint', 'mean of joints')]
+    threes = errors[:1998].reshape(-1, 3)
+    for line, area in zip(axes.lines, axes.collections, strict=True):
+        np.testing.assert_allclose(line.get_xydata().T, [0.033 * (1 + 3 * np.arange(666)), np.median(threes, axis=1)])
+        drawn = area.get_paths()[0].vertices[:, 1]
+        assert np.isin(np.round([threes.min(1), threes.max(1)], 6), np.round(drawn, 6)).all()
+
+
 def test_any_name_of_a_result_can_be_drawn(result, tmp_path):
     odd = [replace(result, name=name) for name in ('costs $1_{ to $2', '100 %', '_old')]
     write_report(odd, tmp_path)
@@ -266,9 +280,10 @@ def test_times_beside_those_of_the_paper_have_numbers_at_their_axis():
 
 
 def test_many_results_with_long_names_can_be_told_apart(result):
-    many = [replace(result, name=f'{k} of {"many " * 40}') for k in range(20)]
+    many = [replace(result, name=f'{k % 5} of {"many " * 40}: {k // 5}') for k in range(20)]
     for figure in plots.curves(many), plots.joint_bars(many):
         figure.draw_without_rendering()
+        assert len(set(legends(figure))) == 20
         (legend,) = figure.findobj(Legend)
         inside = legend.get_window_extent()
         assert figure.bbox.containsx(inside.x0) and figure.bbox.containsx(inside.x1)

@@ -71,11 +71,11 @@ def expected(weights, depths):
 
 
 def test_pictures_beside_those_of_other_images_are_told(tmp_path, folder, command, capsys):
-    pictures = '--overlay', tmp_path / 'pictures'
+    pictures = '--overlay', tmp_path / 'new' / 'pictures'
     assert command(folder / '8.png', *INTRINSICS, *pictures) == 0
     assert 'holds pictures already' not in capsys.readouterr().err
     assert command(folder / '9.png', *INTRINSICS, *pictures) == 0
-    assert f'NOTE: {tmp_path / "pictures"} holds pictures already' in capsys.readouterr().err
+    assert f'NOTE: {pictures[1]} holds pictures already' in capsys.readouterr().err
 
 
 def test_a_folder_of_pngs_into_arrays_and_pictures(tmp_path, folder, command, expected, capsys):
@@ -296,8 +296,12 @@ def test_intrinsics_that_cannot_be_are_refused_at_once(folder, tmp_path, command
     assert '--intrinsics: ' in said and 'must be positive' in said
 
 
-def test_where_nothing_can_be_written_is_said(tmp_path, folder, command, capsys):
+def test_where_nothing_can_be_written_is_said_at_once(tmp_path, folder, command, capsys, monkeypatch):
+    monkeypatch.setattr(estimate, 'estimate', lambda *arguments: pytest.fail('it began'))
     (tmp_path / 'file').write_text('')
+    for name in 'joints.npz', 'joints.mcap':
+        assert command(folder, *INTRINSICS, '--out', tmp_path / 'file' / name) == 1
+        assert f'{tmp_path / "file"}' in capsys.readouterr().err
     assert command(folder, *INTRINSICS, '--overlay', tmp_path / 'file') == 1
     assert f'{tmp_path / "file"}: File exists, and a folder is needed: give another name' in capsys.readouterr().err
 

@@ -13,10 +13,11 @@ from torch import nn
 from hand_pose_ros.cli import main
 from hand_pose_ros.datasets import open_dataset
 from hand_pose_ros.errors import HandPoseError, InputError
+from hand_pose_ros.estimator import HandPoseEstimator
 from hand_pose_ros.models import build
 from hand_pose_ros.models.checkpoints import load_checkpoint
 from hand_pose_ros.models.dense import HandDense
-from hand_pose_ros.runtime import cuda_engine, default_threads, make_engine
+from hand_pose_ros.runtime import cuda_engine, default_threads, make_engine, timing
 from hand_pose_ros.runtime.cuda_engine import LARGEST, CudaEngine, _Captured, exact_convolutions
 from hand_pose_ros.runtime.engine import Pipeline, TorchEngine
 from hand_pose_ros.runtime.fused import fuse
@@ -401,22 +402,77 @@ def test_fused_layers_give_what_the_layers_give():
         torch.testing.assert_close(fused(patches), network(patches), atol=1e-4, rtol=0)
 
 
+@pytest.fixture
+def groups(monkeypatch):
+    """What is measured together: the answers of the calls, and their times."""
+    measured, measure = [], timing.measure
+
+    def kept(calls, rounds):
+        answers = {}
+        times = measure({name: functools.partial(lambda name: answers.update({name: calls[name]()}), name)
+                         for name in calls}, rounds)
+        measured.append((answers, times))
+        return times
+
+    monkeypatch.setattr(timing, 'measure', kept)
+    return measured
+
+
 @pytest.mark.timeout(300)  # nine seconds of CPU time, whatever else the machine does
-def test_bench_measures_every_kind_of_row(tmp_path, capsys):
+def test_bench_measures_every_kind_of_row(tmp_path, capsys, monkeypatch, weights, groups):
+    hands, estimate = set(), HandPoseEstimator.__call__
+
+    def noted(estimator, depth, intrinsics):
+        found = estimate(estimator, depth, intrinsics)
+        hands.add((depth.shape, len(found)))
+        return found
+
+    monkeypatch.setattr(HandPoseEstimator, '__call__', noted)
     file = tmp_path / 'speed.json'
-    assert main(['bench', '--quick', '--threads', '1', '--json', str(file)]) == 0
-    rows = json.loads(file.read_text())['rows']
-    printed = capsys.readouterr().out
-    assert all(name in printed for name in rows)
-    for name in ('network deep_prior: engine', 'network deep_prior: pytorch', 'network deep_prior: floor',
-                 'refine or_ref x2: engine', 'refine or_ref x2: pytorch, joint by joint', 'frame deep_prior',
-                 'stage deep_prior: decode', 'stage deep_prior: detect', 'stage deep_prior: crop',
-                 'stage deep_prior: predict', 'stage deep_prior: uncrop'):
-        assert 0 < rows[name]['p50_ms'] <= rows[name]['p99_ms']
+    assert main(['bench', '--quick', '--threads', '1', '--model', str(weights), '--json', str(file)]) == 0
+    told = json.loads(file.read_text())
+    rows = told['rows']
+    assert told['machine']['threads'] == torch.get_num_threads() == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert (columns := lines[1].split()) == ['p50_ms', 'p99_ms', 'min_ms', 'cpu_ms']
+    for line, (name, row) in zip(lines[2:], rows.items(), strict=True):
+        assert line.split() == [*name.split(), *(f'{row[column]:.3f}' for column in columns if column in row)]
+        assert 0 < row['min_ms'] <= row['p50_ms'] <= row['p99_ms'] and row.get('calls', 10) == 10
+    frames = ('deep_prior', 'deep_prior_orref', 'hand_dense', 'deep_prior, searching', 'hand_dense, searching', weights)
+    assert {f'frame {name}' for name in frames} | {
+        f'stage {name}: {stage}' for name in frames for stage in ('decode', 'detect', 'crop', 'predict', 'uncrop')
+    } | {f'network {name}: {how}' for name in ('deep_prior', 'hand_dense')
+         for how in ('engine', 'pytorch', 'onnxruntime, bare, spinning', 'engine, 8 hands', 'floor')} | {
+        f'refine or_ref x2: {how}' for how in ('engine', 'pytorch, all joints at once', 'pytorch, joint by joint',
+                                               'floor')} <= set(rows)
+    assert not any('compile' in name for name in rows)
+    assert hands == {((480, 640), 1)}, 'in every frame there is one hand'
     # A frame is the sum of its stages, but for what lies between them.
     stages = sum(rows[f'stage deep_prior: {stage}']['min_ms'] for stage in ('decode', 'detect', 'crop', 'predict'))
     assert stages <= rows['frame deep_prior']['p99_ms']
+    # Each is another way to the same joints.
+    for answers in groups[0][0], groups[2][0], groups[4][0]:
+        eight, expected = answers.pop('engine, 8 hands', None), answers['engine']
+        for how, answer in answers.items():
+            answer = answer[0] if isinstance(answer, list) else answer
+            assert np.asarray(answer) == pytest.approx(expected, abs=1e-4), how
+        assert eight is None or eight == pytest.approx(expected.repeat(8, 0), abs=1e-4)
     # Counted by hand: 6.4 million multiply-adds, 2.08 million weights.
     floor = rows['network deep_prior: floor']
     assert floor['operations'] == pytest.approx(2 * 6.4e6, rel=0.05)
     assert floor['weights'] == 2_076_959
+    for name, (answers, times), reads in (('network deep_prior', groups[1], 1), ('refine or_ref x2', groups[5], 2)):
+        floor = rows[f'{name}: floor']
+        assert 512 * answers['read'].numel() == pytest.approx(floor['weights'], abs=512)
+        assert floor['memory_ms'] == pytest.approx(reads * times['read']['min_ms'])
+        multiply_adds = 512 ** 3 / times['multiply']['min_ms'] * floor['compute_ms']
+        assert floor['operations'] == pytest.approx(2 * multiply_adds)
+        assert floor['p50_ms'] == max(floor['memory_ms'], floor['compute_ms'])
+
+
+def test_bench_tells_what_is_wrong_before_it_measures(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(timing, 'measure', lambda *_, **__: pytest.fail('it measured'))
+    for option, value, message in (('--model', 'lost.safetensors', 'lost.safetensors'),
+                                   ('--json', tmp_path, 'is a folder')):
+        assert main(['bench', '--quick', option, str(value)]) == 1
+        assert message in capsys.readouterr().err

@@ -58,9 +58,7 @@ class Intrinsics:
         k, p = [*map(float, info.k)], [*map(float, info.p)]
         fx, fy, cx, cy = (p[0], p[5], p[2], p[6]) if rectified and p[0] != 0 else (k[0], k[4], k[2], k[5])
         if fx == 0:
-            raise InputError(
-                'camera_info has a zero camera matrix: the camera is not calibrated; calibrate it, or set the '
-                'parameters intrinsics.fx, intrinsics.fy, intrinsics.cx and intrinsics.cy')
+            raise InputError('camera_info has a zero camera matrix: the camera is not calibrated; calibrate it')
         roi = info.roi
         width, height = roi.width or info.width, roi.height or info.height
         bin_x, bin_y = info.binning_x or 1, info.binning_y or 1

@@ -141,7 +141,7 @@ class DepthBag(Bag):
         try:
             cameras[info.header.frame_id] = cameras[''] = Intrinsics.from_camera_info(info)
         except InputError as error:  # the first camera_info of some drivers is empty
-            self._unusable = f'{self.path}: {connection.topic}: {error}; or give --intrinsics FX FY CX CY'
+            self._unusable = f'{self.path}: {connection.topic}: {error}, or give --intrinsics FX FY CX CY'
             return False
         return True
 
@@ -155,7 +155,8 @@ class DepthBag(Bag):
         if len(topics) == 1:
             return topics[0]
         if topics:
-            raise InputError(f'{self.path}: several topics carry depth: choose one of {", ".join(topics)}')
+            raise InputError(f'{self.path}: several topics carry depth: choose one with --depth-topic: '
+                             + ', '.join(topics))
         if zstd := sorted(c.topic for c in self.connections if c.topic.endswith(f'/{ZSTD}')):
             raise InputError(f'{self.path}: no topic carries depth that can be read, and of {", ".join(zstd)} '
                              f'{ZSTD_REMEDY}')

@@ -38,6 +38,8 @@ It writes sheet.png, animation.webp (any browser shows it) and summary.json to t
 image was answered. The bag that ships shows a synthetic hand, as a simulated camera sees it.
 """
 
+HINT = 'a bag that needs options is for `hand-pose evaluate --via-ros` or `hand-pose estimate --overlay`'
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the verb takes."""

@@ -23,7 +23,7 @@ class Camera:
 
     Args:
         topic: of the camera_info.
-        remedy: what else the user can do if there is no camera_info; for the error message.
+        remedy: what else the user can do if there is no camera_info that can be used; for the error message.
 
     Attributes:
         waiting: whether an image is waiting for its camera_info at this moment.
@@ -79,7 +79,10 @@ class Camera:
             raise InputError(f'no camera_info arrived on {self.topic}: publish it beside the depth image, remap '
                              f'depth/camera_info, or {self._remedy}')
         with naming(self.topic):
-            intrinsics = Intrinsics.from_camera_info(info, rectified=params.use_rectified)
+            try:
+                intrinsics = Intrinsics.from_camera_info(info, rectified=params.use_rectified)
+            except InputError as error:
+                raise InputError(f'{error}, or {self._remedy}') from error
             intrinsics.check_size(width, height)
             intrinsics.check_lens()
         return intrinsics

@@ -305,7 +305,7 @@ def test_an_interrupted_mcap_gives_what_was_complete(tmp_path, depths, keep):
     assert 1 <= len(frames) <= 20
     for depth in frames:
         np.testing.assert_array_equal(depth, noise)
-    assert 'cut.mcap: the bag was cut short' in said and f'mcap recover {tmp_path}/cut.mcap' in said
+    assert 'cut.mcap: the bag was cut short' in said and f'`mcap recover {tmp_path}/cut.mcap -o repaired.mcap`' in said
     assert f'{len(frames)} of' in said
 
 
@@ -324,13 +324,13 @@ def test_a_folder_without_metadata_is_read(tmp_path, depths):
     (path / 'metadata.yaml').unlink()
     assert_same(path, depths)
     shutil.copy(path / 'folder.mcap', path / 'folder_1.mcap')  # which of several is to be read first?
-    with pytest.raises(InputError, match=r'folder: .* ros2 bag reindex'):
+    with pytest.raises(InputError, match=r'folder: .* `ros2 bag reindex .*folder`'):
         DepthBag(path)
 
 
 @pytest.mark.parametrize(('name', 'remedy'), [
-    ('cut.bag', 'rosbag reindex .*/cut.bag'), ('cut.db3', 'sqlite3 .*/cut.db3 .recover'),
-    ('cut.mcap', 'mcap recover .*/cut.mcap')])
+    ('cut.bag', '`rosbag reindex .*/cut.bag`'), ('cut.db3', '`sqlite3 .*/cut.db3 .recover | sqlite3 repaired.db3`'),
+    ('cut it.mcap', "`mcap recover '.*/cut it.mcap' -o repaired.mcap`")])
 def test_a_bag_that_is_cut_to_pieces_names_the_repair(tmp_path, depths, name, remedy):
     whole = tmp_path / f'whole{Path(name).suffix}'
     write_ros1(whole, depths) if name.endswith('.bag') else write(whole, depths)

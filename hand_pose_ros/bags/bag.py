@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import shlex
 import struct
 from collections.abc import Collection, Iterator
 from functools import lru_cache
@@ -102,7 +103,7 @@ class Bag:
             self._check_open()
             if bytes(data[:4]) == b'\x28\xb5\x2f\xfd':  # zstd; only metadata.yaml says that messages are compressed
                 raise InputError(f'{self.path}: its messages are compressed, which only metadata.yaml says: give the '
-                                 'folder that holds both, or make that file with ros2 bag reindex FOLDER') from error
+                                 'folder that holds both, or make that file with `ros2 bag reindex FOLDER`') from error
             raise InputError(f'{self.path}: a message on {connection.topic} is damaged ({_said(error)}): record or '
                              'copy the bag again') from error
 
@@ -162,19 +163,21 @@ def _said(error: Exception | None) -> str:
 
 
 def _remedy(path: Path) -> str:
+    """What to do with a damaged bag. Commands are in backticks, because more text may follow them."""
+    quoted = shlex.quote(str(path))
     wanted = 'give a .bag, .mcap or .db3 file or the folder of a ROS 2 bag'
     if path.is_file() and not path.stat().st_size:
         return 'it is empty: record or copy it again'
     if path.suffix == '.bag':
-        return f'if it was cut short, repair a copy with: rosbag reindex {path}'
+        return f'if it was cut short, repair a copy with `rosbag reindex {quoted}`'
     if path.suffix == '.mcap' and path.is_file():
         with open(path, 'rb') as file:
             if file.read(5) != b'\x89MCAP':
                 return f'it is no MCAP file: {wanted}'
-        return f'repair it with mcap (github.com/foxglove/mcap): mcap recover {path} -o repaired.mcap'
+        return f'repair it with mcap (github.com/foxglove/mcap): `mcap recover {quoted} -o repaired.mcap`'
     if path.suffix == '.db3':
-        return f'repair it with: sqlite3 {path} .recover | sqlite3 repaired.db3'
-    return f'{wanted}, or repair that folder with: ros2 bag reindex {path}' if path.is_dir() else wanted
+        return f'repair it with `sqlite3 {quoted} .recover | sqlite3 repaired.db3`'
+    return f'{wanted}, or repair that folder with `ros2 bag reindex {quoted}`' if path.is_dir() else wanted
 
 
 class _InterruptedMcap:

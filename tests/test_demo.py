@@ -109,7 +109,8 @@ def test_a_node_that_dies_while_it_is_shown_images_is_told(monkeypatch: pytest.M
     assert {f'__ns:={own}', f'/diagnostics:={own}/diagnostics'} <= set(asked)
 
 
-def test_an_image_without_an_answer_is_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_an_image_without_an_answer_is_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
+                                               capsys: pytest.CaptureFixture[str]) -> None:
     answers = Answers('hand21', {1: HandJointsArray()}, {1: 0.012})
     summary = summarise([1, 2], answers, {1: []}, {})
     assert (summary['frames_in'], summary['frames_answered'], summary['frames_with_a_hand']) == (2, 1, 0)
@@ -128,6 +129,9 @@ def test_an_image_without_an_answer_is_counted(monkeypatch: pytest.MonkeyPatch, 
     write_bag(tmp_path / 'hand.mcap')
     monkeypatch.setattr('hand_pose_ros.ros.live.play_through_node', lambda *_, **__: answers)
     assert main(['demo', '--bag', str(tmp_path / 'hand.mcap'), '--out', str(tmp_path / 'out')]) == 1
+    said = capsys.readouterr()
+    assert f'{COUNT} images got no answer from the node' in said.err
+    assert 'frames answered' in said.out and 'None' not in said.out and 'joint error' not in said.out
 
 
 def test_an_image_that_cannot_be_decoded_is_left_out_of_the_pictures(monkeypatch: pytest.MonkeyPatch,

@@ -435,7 +435,7 @@ def publisher(name: str = 'camera', namespace: str = '/', kind: str = 'Image', *
                            qos_profile=QoSProfile(depth=1, **qos))
 
 
-def test_why_no_image_arrives_is_told() -> None:
+def test_why_no_image_arrives_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     def told(**graph: object) -> str:
         return topics.explain_silence(Graph(**graph), '/depth', Image, 5.0)
 
@@ -450,6 +450,10 @@ def test_why_no_image_arrives_is_told() -> None:
                                 ([publisher(**best_effort)], ReliabilityPolicy.BEST_EFFORT),
                                 ([publisher(**best_effort), publisher(**reliable)], ReliabilityPolicy.RELIABLE)):
         assert 'if it does publish, start the camera driver with' in told(depth=publishers, listens=listens)
+    with monkeypatch.context() as cyclone:
+        cyclone.setattr(topics.qos, 'middleware', lambda: 'rmw_cyclonedds_cpp')
+        said = told(depth=[publisher()])
+        assert 'if it does publish, let rmw_cyclonedds_cpp pass large messages' in said and 'FAST' not in said
     assert 'does not offer the reliability' in told(depth=[publisher(**best_effort)],
                                                     listens=ReliabilityPolicy.RELIABLE)
     assert topics.explain_incompatible(Graph(), '/depth', 'durability').endswith('.durability:=volatile')

@@ -137,6 +137,9 @@ def explain_no_region(node: Node) -> str:
 
 def remedy_for_lost_images() -> str:
     """What to do if large images do not get through."""
+    if 'fastrtps' not in (name := qos.middleware()):
+        return (f'let {name} pass large messages (docs.ros.org: DDS tuning information), or send images with '
+                'the transport compressedDepth')
     return f'start the camera driver with {"=".join(qos.large_image_profile())} in its environment (Fast DDS)'
 
 

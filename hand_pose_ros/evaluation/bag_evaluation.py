@@ -255,14 +255,19 @@ def _attempts(paths: Sequence[str | Path], settings: Settings, sinks: Mapping[st
         return
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context('spawn'), _start_worker)
     try:
-        futures = {pool.submit(_attempt, path, settings, sinks.get(path)): path for path in paths}
+        # A worker inherits what is blocked: Ctrl-C, which reaches all processes, is for this one to pass on.
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT,))
+        try:
+            futures = {pool.submit(_work, path, settings, sinks.get(path)): path for path in paths}
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
         for future in as_completed(futures):
             path = futures[future]
             try:
                 yield path, future.result()
             except Exception as error:  # the process itself died, for example without memory
                 yield path, _unexpected(path, error)
-    except BaseException:  # for example SIGTERM, which does not always reach the other processes, as Ctrl-C does
+    except BaseException:  # for example Ctrl-C
         for worker in multiprocessing.active_children():
             worker.terminate()
         raise
@@ -277,6 +282,14 @@ def _start_worker() -> None:
 
     signal.signal(signal.SIGTERM, stop)  # by default, it would leave half-written bags
     leave_with_parent(GRACE_S)
+
+
+def _work(path: str | Path, settings: Settings, open_sink: OpenSink | None) -> Outcome:
+    """`_attempt` in a process of the pool. If it must stop, it ends here, because the pool would begin the next bag."""
+    try:
+        return _attempt(path, settings, open_sink)
+    except SystemExit:
+        os._exit(1)
 
 
 def _attempt(path: str | Path, settings: Settings, open_sink: OpenSink | None) -> Outcome:

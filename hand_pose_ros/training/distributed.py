@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import timedelta
 
 import torch
 import torch.distributed as dist
@@ -26,7 +27,8 @@ def process_group(device: str) -> Iterator[str]:
         device = f'cuda:{os.environ["LOCAL_RANK"]}'
         check_device(device)
         torch.cuda.set_device(device)
-    dist.init_process_group('nccl' if device.startswith('cuda') else 'gloo')
+    # The others wait while the first process validates, or another machine makes samples: by default, 10 minutes.
+    dist.init_process_group('nccl' if device.startswith('cuda') else 'gloo', timeout=timedelta(days=7))
     try:
         yield device
         dist.barrier()  # the first process validates alone at the end, and the others must not end the group before

@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -15,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from torch.distributed import TCPStore
 
 from hand_pose_ros.bags import Bag, BagWriter, DepthBag, read_hands
 from hand_pose_ros.cli import main
@@ -353,15 +353,14 @@ def test_ctrl_c_loses_no_result(tmp_path, bag, model, monkeypatch):
 def test_processes_of_torchrun_share_the_bags(tmp_path, bag, model):
     """Two processes that find each other as torchrun's do: each reads its share, the first has all results."""
     other = record(tmp_path / 'other.mcap', frames=5)
-    with socket.socket() as free:
-        free.bind(('127.0.0.1', 0))
-        port = free.getsockname()[1]
+    store = TCPStore('127.0.0.1', 0, is_master=True, wait_for_workers=False)  # at a port that nobody else can take
     processes = [subprocess.Popen(
         [sys.executable, '-m', 'hand_pose_ros.cli', 'evaluate', str(bag), str(other), '--model', model, '--device',
          'cpu', '--min-score', '0', '--json', str(tmp_path / f'{rank}.json')],
         env={**os.environ, 'RANK': str(rank), 'WORLD_SIZE': '2', 'LOCAL_WORLD_SIZE': '2', 'MASTER_ADDR': '127.0.0.1',
-             'MASTER_PORT': str(port)}) for rank in range(2)]
-    assert [process.wait(timeout=100) for process in processes] == [0, 0]
+             'MASTER_PORT': str(store.port), 'TORCHELASTIC_USE_AGENT_STORE': 'True',
+             'TORCHELASTIC_RESTART_COUNT': '0'}) for rank in range(2)]
+    assert [process.wait(timeout=250) for process in processes] == [0, 0]
     assert not (tmp_path / '1.json').exists()
     got = json.loads((tmp_path / '0.json').read_text())['bags']
     assert {name: one['frames'] for name, one in got.items()} == {str(bag): FRAMES, str(other): 5}

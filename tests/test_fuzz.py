@@ -212,11 +212,11 @@ def test_camera_infos(message: CameraInfo, rectified: bool) -> None:
     assert np.isfinite([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy]).all()
 
 
-@pytest.fixture(scope='module', params=['raw', 'compressedDepth'])
-def node(request: pytest.FixtureRequest, weights: Path) -> Iterator[EstimatorNode]:
+@pytest.fixture(params=['raw', 'compressedDepth'])
+def node(request: pytest.FixtureRequest, weights: Path, ros_domain: int) -> Iterator[EstimatorNode]:
     """A node that is called directly, as DDS would not let half of the messages through, and answers into `said`."""
     context = rclpy.Context()
-    context.init(domain_id=99)
+    context.init(domain_id=ros_domain)
     values = {'model': str(weights), 'min_score': 0.0, 'camera_info_timeout': 0.0, 'max_hands': 2, 'smoothing': 1.0,
               'num_threads': 1, 'publish_poses': True, 'publish_joint_states': True, 'transport': request.param}
     node = EstimatorNode(context=context, namespace='/fuzz',

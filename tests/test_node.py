@@ -143,7 +143,7 @@ class Rig:
                    and (self.node is None or any(sub.topic_name.endswith(publisher.topic_name)
                                                  and sub.get_publisher_count() for sub in self.node.subscriptions)))
 
-    def until(self, condition: Callable[[], object], what: str = 'it', seconds: float = 10.0) -> None:
+    def until(self, condition: Callable[[], object], what: str = 'it', seconds: float = 60.0) -> None:
         deadline = time.monotonic() + seconds
         while not condition():
             assert time.monotonic() < deadline, f'waited in vain for {what}; the node said: {self.said()}'
@@ -165,7 +165,7 @@ class Rig:
 
     def call(self, kind: type, service: str, **fields):
         client = self.client.create_client(kind, f'/estimator/{service}')
-        assert client.wait_for_service(5)
+        assert client.wait_for_service(60)
         return self.result(client.call_async(kind.Request(**fields)))
 
     def result(self, future):
@@ -182,7 +182,7 @@ class Rig:
 
     def set_parameter(self, name: str, value) -> tuple[bool, str]:
         client = AsyncParameterClient(self.client, 'estimator')
-        assert client.wait_for_services(5)
+        assert client.wait_for_services(60)
         result = self.result(client.set_parameters([Parameter(name, value=value)])).results[0]
         return result.successful, result.reason
 
@@ -399,12 +399,12 @@ def test_a_slow_network_gets_the_newest_image_never_a_queue(rig: Rig, monkeypatc
 
     def slow(*arguments) -> HandJointsArray:
         entered.set()
-        go.wait(20)
+        go.wait(60)
         return convert(*arguments)
 
     monkeypatch.setattr(conversions, 'hands_to_msg', slow)
     publish(image(depth_with_hand(), 2))
-    assert entered.wait(10)
+    assert entered.wait(60)
     for stamp in range(3, 10):
         publish(image(depth_with_hand(), stamp))
         rig.until(lambda n=stamp: node._statistics._totals['received'] == n, f'image {stamp}')
@@ -423,11 +423,11 @@ def test_to_stop_is_to_finish_what_is_in_flight_and_to_forget_what_waits() -> No
 
     def handle(item: int) -> None:
         entered.set()
-        go.wait(20)
+        go.wait(60)
         done.append(item)
 
     worker = NewestWorker(handle)
-    assert not worker.put(1) and entered.wait(10) and not worker.put(2)
+    assert not worker.put(1) and entered.wait(60) and not worker.put(2)
     stopping = threading.Thread(target=lambda: (worker.stop(), done.append('stopped')))
     stopping.start()
     stopping.join(0.1)  # in which it must not end

@@ -7,10 +7,10 @@ import re
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -80,14 +80,15 @@ def run(args: argparse.Namespace) -> int:
     with ExitStack() as stack:
         images, number = _open(args, stack)
         estimator = make_estimator(args)
-        sinks: list[_Sink] = []
+        sinks: list[Sink] = []
         if args.overlay:
-            sinks.append(_Overlays(args.overlay, estimator.skeleton))
+            sinks.append(_overlays(args.overlay, estimator.skeleton))
         if args.out and args.out.suffix == '.npz':
-            sinks.append(_Arrays(args.out, estimator.skeleton))
+            sinks.append(stack.enter_context(_arrays(args.out, estimator.skeleton)))
         elif args.out:
-            sinks.append(_Messages(stack.enter_context(HandBag(args.out, estimator.skeleton, estimator.metadata))))
-        failed = estimate(images, number, estimator, sinks)
+            bag = stack.enter_context(HandBag(args.out, estimator.skeleton, estimator.metadata))
+            sinks.append(lambda image, _depth, _intrinsics, hands: bag.add(image, hands))
+        failed = estimate(images, number, estimator, sinks, stack)
     print('wrote', ' and '.join(str(path) for path in (args.out, args.overlay) if path))
     return failed
 
@@ -103,26 +104,24 @@ class DepthInput:
     load: Callable[[], tuple[NDArray[np.float32], Intrinsics]]
 
 
-class _Sink(Protocol):
-    """Writes the results in one way."""
-
-    def add(self, image: DepthInput, depth: NDArray[np.float32], intrinsics: Intrinsics,
-            hands: Sequence[HandEstimate]) -> None: ...
-
-    def finish(self) -> None:
-        """Called when all images were added."""
-        return
+Sink = Callable[[DepthInput, NDArray[np.float32], Intrinsics, Sequence[HandEstimate]], None]
+"""Takes an image with its depth (H, W) in metres, its intrinsics and its hands, and writes them in one way."""
 
 
-def estimate(images: Iterator[DepthInput], number: int, estimator: HandPoseEstimator, sinks: Sequence[_Sink]) -> int:
+def estimate(images: Iterator[DepthInput], number: int, estimator: HandPoseEstimator, sinks: Sequence[Sink],
+             files: ExitStack) -> int:
     """Run the estimator over all images and pass the results to the sinks. Returns 1 if any image could not be used.
 
     Such images are reported and left out.
 
+    Args:
+        files: what is open. It is closed, and so the outputs are complete, before the summary is printed, which may
+            fail.
+
     Raises:
         InputError: none of the images could be used.
     """
-    done = found = failed = 0
+    found = failed = 0
     problem, said = '', ''
     seconds: list[float] = []
     for image in tqdm(images, total=number, unit='image', disable=None):
@@ -137,15 +136,14 @@ def estimate(images: Iterator[DepthInput], number: int, estimator: HandPoseEstim
                 tqdm.write(f'hand-pose estimate: {error}', file=sys.stderr)
             said = str(error)
             continue
-        done += 1
         found += bool(hands)
         problem = problem or ('' if hands else depth_problem(depth, estimator.near, estimator.far))
         for sink in sinks:
-            sink.add(image, depth, intrinsics, hands)
+            sink(image, depth, intrinsics, hands)
+    done = len(seconds)
     if not done:
         raise InputError(f'none of the images ({failed}) could be used, so nothing was written')
-    for sink in sinks:
-        sink.finish()
+    files.close()
     print(f'{counted(done, "images")}, {found} with a hand, {failed} that could not be used; '
           f'{1000 * float(np.median(seconds)):.1f} ms for the median image')
     if not found:
@@ -204,61 +202,44 @@ def _natural(path: Path) -> list[Any]:
     return [int(part) if part.isdecimal() else part for part in re.split(r'(\d+)', path.name)]
 
 
-class _Overlays(_Sink):
-    """A picture of each image."""
+def _overlays(folder: Path, skeleton: Skeleton) -> Sink:
+    """Draws a picture of each image."""
+    folder.mkdir(parents=True, exist_ok=True)
+    if any(folder.glob('*.png')):
+        print(f'NOTE: {folder} holds pictures already, and those of other images stay there', file=sys.stderr)
 
-    def __init__(self, folder: Path, skeleton: Skeleton) -> None:
-        self._folder, self._skeleton = folder, skeleton
-        folder.mkdir(parents=True, exist_ok=True)
-        if any(folder.glob('*.png')):
-            print(f'NOTE: {folder} holds pictures already, and those of other images stay there', file=sys.stderr)
-
-    def add(self, image: DepthInput, depth: NDArray[np.float32], intrinsics: Intrinsics,
-            hands: Sequence[HandEstimate]) -> None:
-        path = self._folder / f'{image.name}.png'
-        picture = cv2.imencode('.png', overlay(depth, intrinsics, hands, self._skeleton))[1]
-        write_bytes(path, picture.tobytes())  # OpenCV itself crashes at names that are not UTF-8
+    def draw(image: DepthInput, depth: NDArray[np.float32], intrinsics: Intrinsics,
+             hands: Sequence[HandEstimate]) -> None:
+        picture = cv2.imencode('.png', overlay(depth, intrinsics, hands, skeleton))[1].tobytes()
+        write_bytes(folder / f'{image.name}.png', picture)  # OpenCV itself crashes at names that are not UTF-8
+    return draw
 
 
-class _Arrays(_Sink):
-    """One .npz with everything."""
+@contextmanager
+def _arrays(path: Path, skeleton: Skeleton) -> Iterator[Sink]:
+    """Keeps all hands, and writes one .npz in the end. After an error, nothing is written."""
+    check_writable(path)
+    images: list[DepthInput] = []
+    rows: list[tuple[int, HandEstimate]] = []
 
-    def __init__(self, path: Path, skeleton: Skeleton) -> None:
-        check_writable(path)
-        self._path, self._skeleton = path, skeleton
-        self._images: list[DepthInput] = []
-        self._hands: list[tuple[int, HandEstimate]] = []
+    def keep(image: DepthInput, _depth: Any, _intrinsics: Any, hands: Sequence[HandEstimate]) -> None:
+        rows.extend((len(images), hand) for hand in hands)
+        images.append(image)
 
-    def add(self, image: DepthInput, depth: NDArray[np.float32], intrinsics: Intrinsics,
-            hands: Sequence[HandEstimate]) -> None:
-        self._hands += [(len(self._images), hand) for hand in hands]
-        self._images.append(image)
-
-    def finish(self) -> None:
-        hands, joints = [hand for _, hand in self._hands], len(self._skeleton)
-        with in_one_step(self._path) as part, part.open('wb') as file:
-            np.savez_compressed(
-                file,
-                names=np.array([image.name for image in self._images]),
-                stamp_ns=np.array([image.stamp_ns for image in self._images], np.int64),
-                frame=np.array([frame for frame, _ in self._hands], np.int64),
-                joints=np.array([hand.joints for hand in hands], np.float32).reshape(-1, joints, 3),
-                confidence=np.array([hand.confidence for hand in hands], np.float32).reshape(-1, joints),
-                score=np.array([hand.score for hand in hands], np.float32),
-                side=np.array([hand.side for hand in hands], 'U7'),
-                id=np.array([hand.id for hand in hands], 'U32'),
-                cube_center=np.array([hand.cube.center for hand in hands], np.float32).reshape(-1, 3),
-                cube_side=np.array([hand.cube.side for hand in hands], np.float32),
-                joint_names=np.array(self._skeleton.joint_names),
-                skeleton=np.array(self._skeleton.name))
-
-
-class _Messages(_Sink):
-    """An MCAP file with the messages that the node would publish."""
-
-    def __init__(self, bag: HandBag) -> None:
-        self._bag = bag
-
-    def add(self, image: DepthInput, depth: NDArray[np.float32], intrinsics: Intrinsics,
-            hands: Sequence[HandEstimate]) -> None:
-        self._bag.add(image, hands)
+    yield keep
+    hands, joints = [hand for _, hand in rows], len(skeleton)
+    with in_one_step(path) as part, part.open('wb') as file:
+        np.savez_compressed(
+            file,
+            names=np.array([image.name for image in images]),
+            stamp_ns=np.array([image.stamp_ns for image in images], np.int64),
+            frame=np.array([frame for frame, _ in rows], np.int64),
+            joints=np.array([hand.joints for hand in hands], np.float32).reshape(-1, joints, 3),
+            confidence=np.array([hand.confidence for hand in hands], np.float32).reshape(-1, joints),
+            score=np.array([hand.score for hand in hands], np.float32),
+            side=np.array([hand.side for hand in hands], 'U7'),
+            id=np.array([hand.id for hand in hands], 'U32'),
+            cube_center=np.array([hand.cube.center for hand in hands], np.float32).reshape(-1, 3),
+            cube_side=np.array([hand.cube.side for hand in hands], np.float32),
+            joint_names=np.array(skeleton.joint_names),
+            skeleton=np.array(skeleton.name))

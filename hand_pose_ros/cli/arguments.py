@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,58 +16,45 @@ if TYPE_CHECKING:
     from hand_pose_ros.estimator import HandPoseEstimator
 
 
-def _whole(text: str) -> int:
+def _number(text: str, fits: Callable[[float], bool], why: str) -> float:
     try:
-        return int(text)
+        value = float(text)
     except ValueError:  # of it, argparse would name the function
-        raise argparse.ArgumentTypeError(f'{text} is not a whole number') from None
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
         raise argparse.ArgumentTypeError(f'{text} is not a number') from None
+    if not fits(value):
+        raise argparse.ArgumentTypeError(f'{text} is {why}')
+    return value
 
 
-def count(text: str) -> int:
+def count(text: str, least: int = 1) -> int:
     """1 or more."""
-    value = _whole(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f'{text} is less than 1')
-    return value
-
-
-def share(text: str) -> float:
-    """0 to 1."""
-    value = _number(text)
-    if not 0 <= value <= 1:
-        raise argparse.ArgumentTypeError(f'{text} is not between 0 and 1')
-    return value
-
-
-def metres(text: str) -> float:
-    """More than 0 and at most 1, as the unit of depth is."""
-    value = _number(text)
-    if not 0 < value <= 1:
-        raise argparse.ArgumentTypeError(f'{text} is not more than 0 and at most 1 (metres)')
-    return value
-
-
-def cube(text: str) -> float:
-    """0.05 to 1 m, as the node takes it."""
-    value = _number(text)
-    if not 0.05 <= value <= 1:
-        raise argparse.ArgumentTypeError(f'{text} is not between 0.05 and 1 (metres)')
+    try:
+        value = int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f'{text} is not a whole number') from None
+    if value < least:
+        raise argparse.ArgumentTypeError(f'{text} is less than {least}')
     return value
 
 
 def none_or_more(text: str) -> int:
     """0 or more."""
-    value = _whole(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f'{text} is less than 0')
-    return value
+    return count(text, least=0)
+
+
+def share(text: str) -> float:
+    """0 to 1."""
+    return _number(text, lambda value: 0 <= value <= 1, 'not between 0 and 1')
+
+
+def metres(text: str) -> float:
+    """More than 0 and at most 1, as the unit of depth is."""
+    return _number(text, lambda value: 0 < value <= 1, 'not more than 0 and at most 1 (metres)')
+
+
+def cube(text: str) -> float:
+    """0.05 to 1 m, as the node takes it."""
+    return _number(text, lambda value: 0.05 <= value <= 1, 'not between 0.05 and 1 (metres)')
 
 
 def keep_input(output: str | Path | None, source: str | Path | None) -> None:

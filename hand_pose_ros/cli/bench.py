@@ -49,6 +49,7 @@ def run(args: argparse.Namespace) -> int:
     import torch
 
     from hand_pose_ros import __version__
+    from hand_pose_ros.evaluation.tables import number, text_table
     from hand_pose_ros.files import check_writable, write_json
     from hand_pose_ros.models.checkpoints import load_checkpoint
     from hand_pose_ros.runtime import default_threads, make_engine
@@ -71,7 +72,9 @@ def run(args: argparse.Namespace) -> int:
         'cpu': _cpu_name(), 'cores': os.cpu_count(), 'threads': threads, 'python': platform.python_version(),
         'torch': torch.__version__, 'onnxruntime': onnxruntime.__version__, 'hand_pose_ros': __version__}
     print(', '.join(f'{key} {value}' for key, value in machine.items()))
-    print(_table(rows))
+    columns = ('p50_ms', 'p99_ms', 'min_ms', 'cpu_ms')
+    print(text_table(('', *columns), [(name, *(number(row.get(column), 3) for column in columns))
+                                      for name, row in rows.items()]))
     if args.json:
         write_json(args.json, {'machine': machine, 'rows': rows})
     return 0
@@ -243,12 +246,3 @@ def _cpu_name() -> str:
         return next(line.split(': ')[1] for line in lines if line.startswith('model name'))
     except (OSError, StopIteration):
         return platform.processor() or platform.machine()
-
-
-def _table(rows: dict[str, dict[str, float]]) -> str:
-    width = max(map(len, rows))
-    columns = ('p50_ms', 'p99_ms', 'min_ms', 'cpu_ms')
-    lines = [' ' * width + ''.join(f'{column:>10}' for column in columns)]
-    lines += [f'{name:{width}}' + ''.join(f'{row[c]:10.3f}' if c in row else ' ' * 10 for c in columns)
-              for name, row in rows.items()]
-    return '\n'.join(lines)

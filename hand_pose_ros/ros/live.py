@@ -12,7 +12,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -58,13 +58,13 @@ def play_through_node(bag: DepthBag, camera_info_topic: str | None = None,
                       parameters: Mapping[str, Any] | None = None, patient: bool = False) -> Answers:
     """Start the node `estimator` in its own namespace, play the depth images at their recorded pace, and stop the node.
 
+    A damaged bag is played as far as possible.
+
     Args:
         camera_info_topic: needed if it is not beside the depth topic.
         parameters: of the node.
         patient: wait for each answer before the next image. So a machine that is too slow or busy plays slower. Without
             this, the node drops images, as it does with a camera.
-
-    A damaged bag is played as far as possible.
 
     Raises:
         HandPoseError: the node does not start, or dies.
@@ -94,12 +94,10 @@ def play_through_node(bag: DepthBag, camera_info_topic: str | None = None,
             _wait_until(lambda: bool(listener.skeleton or listener.failure), process, START_TIMEOUT_S)
             if listener.failure:
                 raise HandPoseError(f'the node does not start: {listener.failure}')
-            replay = Replay(bag, topics={bag.depth_topic, *infos}, reliability='reliable')
+            with closing(Replay(bag, topics={bag.depth_topic, *infos}, reliability='reliable')) as replay:
+                def answered() -> bool:
+                    return len(listener.answers) >= replay.published[bag.depth_topic]
 
-            def answered() -> bool:
-                return len(listener.answers) >= replay.published[bag.depth_topic]
-
-            try:
                 replay.wait_for_subscribers(START_TIMEOUT_S, 2 + len(infos))  # node and listener; camera_info: node
                 try:
                     replay.play(ready=answered if patient else None)
@@ -107,8 +105,6 @@ def play_through_node(bag: DepthBag, camera_info_topic: str | None = None,
                     if not replay.published[bag.depth_topic]:
                         raise
                 listener.wait_until_quiet()  # an image still on the way is lost when its publisher is closed
-            finally:
-                replay.close()
             if process.poll() is not None:
                 raise HandPoseError(f'the node died with exit code {process.returncode}: its last words are above')
         answers, seen = listener.answers, listener.seen

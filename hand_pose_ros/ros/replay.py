@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from itertools import chain
 from os import PathLike
 from typing import Any
@@ -223,12 +223,8 @@ def replaying(path: str | PathLike[str], ros_args: Sequence[str] = (), **options
     # Without the signal handlers of rclpy, Ctrl-C arrives between two messages.
     ros.init(['--ros-args', *ros_args], signal_handler_options=SignalHandlerOptions.NO)
     try:
-        with Bag(path) as bag:
-            replay = Replay(bag, **options)
-            try:
-                yield replay
-            finally:
-                replay.close()
+        with Bag(path) as bag, closing(Replay(bag, **options)) as replay:
+            yield replay
     finally:
         rclpy.try_shutdown()
 

@@ -397,7 +397,7 @@ def test_a_camera_with_less_than_an_image_a_second_is_not_stale_between_its_imag
     now = 0.0
     monkeypatch.setattr('hand_pose_ros.ros.diagnostics.time', SimpleNamespace(perf_counter=lambda: now))
     statistics = Statistics()
-    nothing, one = (DiagnosticStatus.STALE, 'no images'), (DiagnosticStatus.OK, '1 images answered, 0 hands')
+    nothing, one = (DiagnosticStatus.STALE, 'no images'), (DiagnosticStatus.OK, '1 image answered, 0 hands')
     assert [report(), report(1.5), report(), report(3.5), report()] == [nothing, one, one, one, one]
     warning = DiagnosticStatus.WARN, 'no readings'
     assert [report(5.5, problem='no readings'), report()] == [warning, warning], 'no news is no good news'

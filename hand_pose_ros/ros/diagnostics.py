@@ -121,11 +121,9 @@ class Statistics:
         elapsed = now - window.since
         counts = window.counts
         self._count_arrivals(counts if state == 'active' and published else Counter())
-        quiet = (DiagnosticStatus.STALE, 'no images') if late else self._told
-        judged = _judge(window, state, self._arrived, self.silence, quiet)
-        if counts['received']:
-            self._told = judged
-        level, message = (DiagnosticStatus.ERROR, self.failure) if self.failure else judged
+        level, message = self._judge(window, state, late)
+        if counts['received'] and not self.failure:
+            self._told = level, message
         values = {'state': state, 'input_hz': f'{counts["received"] / elapsed:.1f}',
                   'output_hz': f'{counts["answered"] / elapsed:.1f}'}
         for stage, seconds in window.seconds.items():
@@ -145,26 +143,28 @@ class Statistics:
         if self._arriving['camera_infos'] >= MIN_SAMPLE:
             self._arrived, self._arriving = self._arriving, Counter()
 
-
-def _judge(window: _Window, state: str, arrived: Counter[str], silence: str,
-           quiet: tuple[bytes, str]) -> tuple[bytes, str]:
-    """Level and message of the worst problem; `quiet` if there is none, but no image either."""
-    counts = window.counts
-    if window.problem:
-        return DiagnosticStatus.WARN, window.problem
-    if state != 'active':
-        return DiagnosticStatus.OK, f'the node is {state}'
-    if silence:  # it says more than that images are missing
-        return DiagnosticStatus.STALE, silence
-    if arrived['received'] < (1 - MAX_DROPPED) * arrived['camera_infos']:
-        return DiagnosticStatus.WARN, (f'{arrived["camera_infos"]} camera_info but only '
-                                       f'{counted(arrived["received"], "images")} arrived: if there should be as many, '
-                                       + remedy_for_lost_images())
-    if counts['received'] == 0:
-        return quiet
-    # Images that wait for their camera_info are reported elsewhere.
-    too_many = counts['dropped'] - counts['waited'] > MAX_DROPPED * counts['received']
-    if counts['received'] >= MIN_SAMPLE and too_many:
-        return DiagnosticStatus.WARN, (f'{counts["dropped"]} of {counts["received"]} images of a second were dropped: '
-                                       'this machine is too slow, or too busy, for their rate')
-    return DiagnosticStatus.OK, f'{counted(counts["answered"], "images")} answered, {counted(counts["hands"], "hands")}'
+    def _judge(self, window: _Window, state: str, late: bool) -> tuple[bytes, str]:
+        """Level and message of the worst problem."""
+        counts, arrived = window.counts, self._arrived
+        if self.failure:
+            return DiagnosticStatus.ERROR, self.failure
+        if window.problem:
+            return DiagnosticStatus.WARN, window.problem
+        if state != 'active':
+            return DiagnosticStatus.OK, f'the node is {state}'
+        if self.silence:  # it says more than that images are missing
+            return DiagnosticStatus.STALE, self.silence
+        if arrived['received'] < (1 - MAX_DROPPED) * arrived['camera_infos']:
+            return DiagnosticStatus.WARN, (
+                f'{arrived["camera_infos"]} camera_info but only {counted(arrived["received"], "images")} arrived: if '
+                f'there should be as many, {remedy_for_lost_images()}')
+        if counts['received'] == 0:
+            return (DiagnosticStatus.STALE, 'no images') if late else self._told
+        # Images that wait for their camera_info are reported elsewhere.
+        too_many = counts['dropped'] - counts['waited'] > MAX_DROPPED * counts['received']
+        if counts['received'] >= MIN_SAMPLE and too_many:
+            return DiagnosticStatus.WARN, (
+                f'{counts["dropped"]} of {counts["received"]} images of a second were dropped: this machine is too '
+                'slow, or too busy, for their rate')
+        return DiagnosticStatus.OK, (
+            f'{counted(counts["answered"], "images")} answered, {counted(counts["hands"], "hands")}')

@@ -86,9 +86,9 @@ def _hands(args: argparse.Namespace, sensors: list[str] | None, **options: Any) 
     return SyntheticHands(args.split, sensors=sensors, hand=Rig(args.rig) if args.rig else None, **options)
 
 
-def _indices(start: int, number: int, step: int) -> Iterator[Tensor]:
+def _indices(args: argparse.Namespace, step: int) -> tuple[Tensor, ...]:
     import torch
-    return iter(torch.arange(start, start + number).split(step))
+    return torch.arange(args.start, args.start + args.number).split(step)
 
 
 def _real(args: argparse.Namespace) -> Iterator[tuple[str, list[tuple[NDArray[np.float32], float]]]]:
@@ -174,7 +174,7 @@ def _write(args: argparse.Namespace) -> None:
     check_device(args.device)
     hands = _hands(args, args.sensors, device=args.device)
     args.out.mkdir(parents=True, exist_ok=True)
-    for indices in tqdm(list(_indices(args.start, args.number, args.shard)), unit='shard', disable=None):
+    for indices in tqdm(_indices(args, args.shard), unit='shard', disable=None):
         arrays: dict[str, Any] = {name: values.cpu().numpy() for name, values in hands.batch(indices).items()}
         arrays['index'] = indices.numpy()
         arrays['patch'] = arrays['patch'].astype(np.float16)  # exact to 0.1 mm
@@ -212,7 +212,7 @@ def _stats(args: argparse.Namespace) -> None:
 
     columns = {f'real {name}': summarise(patches) for name, patches in _real(args)}
     hands, patches = _hands(args, args.sensors), []
-    for indices in _indices(args.start, args.number, 64):
+    for indices in _indices(args, 64):
         batch = hands.batch(indices)
         patches += [(batch['patch'][i, 0].numpy(), float(batch['cube_side'][i]))
                     for i in batch['hand_present'].nonzero()[:, 0].tolist()]

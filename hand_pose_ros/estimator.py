@@ -227,7 +227,6 @@ class HandPoseEstimator:
                     max_through=1 if 'hand' in self.engine.outputs else MAX_THROUGH)
             reading = self._read(depth, intrinsics, cube, track) if alive else None
             if reading is not None and reading.score >= self.min_score and not _overlaps(reading.cube, hands):
-                self._tracks.append(track)
                 hands.append(self._follow(track, reading, dt))
         self._find(depth, intrinsics, hands, dt, regions)
         return hands
@@ -267,7 +266,6 @@ class HandPoseEstimator:
                 alarms -= 1
                 continue
             track.id = f'hand_{next(self._ids)}'
-            self._tracks.append(track)
             hands.append(self._follow(track, reading, dt))
             if self.tracking:  # else the next objects would never be looked at
                 alarms = min(alarms, 1)
@@ -330,6 +328,8 @@ class HandPoseEstimator:
         return np.stack([confidence for confidence, _ in judged]), score, score
 
     def _follow(self, track: _Track, reading: _Reading, dt: float) -> HandEstimate:
+        """The hand that was read. In the next image, it is tracked."""
+        self._tracks.append(track)
         track.rightness = SIDE_MEMORY * track.rightness + reading.rightness
         track.sizes, track.images = track.sizes + reading.size, track.images + 1
         joints = reading.joints

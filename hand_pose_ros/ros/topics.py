@@ -104,6 +104,7 @@ def explain_silence(node: Node, topic: str, message_type: type, seconds: float) 
     topic_type = f'sensor_msgs/msg/{message_type.__name__}'
     said = f'no image arrived on {topic} for {seconds:.0f} s; the topic is {describe_publishers(node, topic)}'
     infos = node.get_publishers_info_by_topic(topic)
+    right_type = any(info.topic_type == topic_type for info in infos)
     image, _ = split_transport(topic)
     if not infos:
         for transport in TRANSPORTS:
@@ -112,14 +113,14 @@ def explain_silence(node: Node, topic: str, message_type: type, seconds: float) 
                 return (f'{said}, but depth is published on {other}: set the parameter transport to {transport} '
                         f'(at the start: --ros-args -p transport:={transport})')
     zstd = f'{image.removesuffix(f"/{ZSTD}")}/{ZSTD}'
-    if all(info.topic_type != topic_type for info in infos) and node.count_publishers(zstd):
+    if not right_type and node.count_publishers(zstd):
         return f'{said}, but on {zstd} there are images: {ZSTD_REMEDY}'
     if not infos:
         ours = {topic, *(publisher.topic_name for publisher in node.publishers)}
         others = [name for name, types in node.get_topic_names_and_types() if topic_type in types and name not in ours]
         where = f' ({topic_type} is published on {", ".join(others)})' if others else ''
         return f'{said}{where}: start the camera, or name its topic with --ros-args -r {IMAGE}:=/its/topic'
-    if all(info.topic_type != topic_type for info in infos):
+    if not right_type:
         return f'{said}, but {topic_type} is expected: remap {IMAGE}, or set the parameter transport'
     wanted = QoSReliabilityPolicy.RELIABLE
     if all(info.qos_profile.reliability != wanted for info in infos) and any(

@@ -124,7 +124,7 @@ def close_up(depth: NDArray[np.float32], intrinsics: Intrinsics, cube: Cube, joi
 
 
 def contact_sheet(pictures: Sequence[Picture], columns: int = 4) -> Picture:
-    """Pictures of any size in a grid, in reading order. Each cell is as large as the largest picture."""
+    """Pictures of any size (at least one) in a grid, in reading order. Each cell is as large as the largest picture."""
     height, width = (max(picture.shape[axis] for picture in pictures) for axis in (0, 1))
     columns = min(columns, len(pictures))
     rows = -(-len(pictures) // columns)
@@ -170,7 +170,12 @@ def _dot(picture: Picture, center: NDArray[np.float64], radius: float, color: tu
 
 
 def caption(picture: Picture, text: str, at: tuple[int, int] = (10, 24), size: float = 0.7) -> None:
-    """Write white letters with a black outline into the upper left corner of a picture."""
+    """Write white letters with a black outline into a picture.
+
+    Args:
+        at: column and row of the lower left corner of the text; by default in the upper left corner of the picture.
+        size: a factor, as OpenCV takes it.
+    """
     around = [((x, y), (0, 0, 0)) for x in (-1, 0, 1) for y in (-1, 0, 1)]  # thicker letters are wider
     for (x, y), color in (*around, ((0, 0), (255, 255, 255))):
         cv2.putText(picture, text, (at[0] + x, at[1] + y), cv2.FONT_HERSHEY_SIMPLEX, size, color, 1, cv2.LINE_AA)

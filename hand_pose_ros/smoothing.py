@@ -25,7 +25,10 @@ class OneEuroFilter:
         self._speed: NDArray[np.float64] = np.zeros(())
 
     def __call__(self, value: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
-        """Filter points (..., 3) in metres, `dt` seconds after the last ones. Each point has its own speed."""
+        """Filter points (..., 3) in metres, `dt` seconds after the last ones. Each point has its own speed.
+
+        If no time has passed, or time went back, the filter starts again with these points.
+        """
         last = self._value
         if last is None or dt <= 0:
             self._value, self._speed = value, np.zeros((*value.shape[:-1], 1))

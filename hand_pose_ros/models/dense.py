@@ -254,6 +254,7 @@ class Residual(nn.Module):
 
 
 def conv_norm(inputs: int, outputs: int, size: int, stride: int = 1) -> nn.Sequential:
+    """A convolution of an odd size, and its norm. Height and width are divided by the stride."""
     convolution = nn.Conv2d(inputs, outputs, size, stride, padding=size // 2, bias=False)
     nn.init.kaiming_normal_(convolution.weight, nonlinearity='relu')
     return nn.Sequential(convolution, nn.BatchNorm2d(outputs))

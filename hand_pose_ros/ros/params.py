@@ -35,6 +35,9 @@ _ALWAYS = 'for good'
 @dataclass(frozen=True)
 class Params:
     """Values of all parameters (metres and seconds). A change at run time makes a new object, used from the next image.
+
+    Raises:
+        HandPoseError: a value is not among its choices, or two values contradict each other.
     """
 
     model: str = _parameter('', 'Name of weights that ship, or path of a checkpoint; empty = the default weights.',

@@ -222,10 +222,7 @@ class Run:
         recipe = self.recipe
         for group in self.optimizer.param_groups:
             group['lr'] = learning_rate(recipe, self.step / self.steps)
-        if self._next is None:
-            self._prepare()
-        batch, self._next = self._next, None
-        assert batch is not None
+        batch, self._next = self._next or self._prepare(), None
         if self._aside:
             torch.cuda.current_stream(self.device).wait_stream(self._aside)
         torch.manual_seed((recipe.seed * 1_000_003 + self.step) * 1009 + self.rank)  # for dropout
@@ -236,20 +233,20 @@ class Run:
         self.step += 1
         try:
             if self._aside and self.step < self.steps:
-                self._prepare()  # while the GPU computes this step
+                self._next = self._prepare()  # while the GPU computes this step
         finally:  # also if a signal ends the wait, because a spoilt state must not be saved
             self._check(batch, terms)
         return terms
 
-    def _prepare(self) -> None:
-        """Load the batch of the next step to the device, and augment it."""
+    def _prepare(self) -> Batch:
+        """The batch of the next step, on the device and augmented."""
         with self._interruptible(), torch.cuda.stream(self._aside) if self._aside else nullcontext():
             batch, numbers = self.stream.batch(self.step)
             batch = {key: value.to(self.device, non_blocking=True) for key, value in batch.items()}
             batch = augment(batch, self.recipe.augmentation, numbers, self.recipe.seed)
             # Not shifted as in `augment`, so that an objective draws other random numbers.
             batch['numbers'] = numbers.to(self.device) + (self.recipe.seed << 41)
-        self._next = batch
+        return batch
 
     def _check(self, batch: Batch, terms: Terms) -> None:
         """Make sure that the loss of the last step is finite, and find out whether the run must end after this step."""

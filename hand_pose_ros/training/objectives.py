@@ -29,7 +29,7 @@ class PoseObjective(nn.Module):
 
     def forward(self, batch: Batch) -> Terms:
         joints, truth = self.predict(batch['patch']).float(), chosen(batch['joints'], self.joints)
-        return {'joints': joint_loss(self.recipe.loss, self.recipe.knee, joints, truth, joints_count(batch))}
+        return {'joints': joint_loss(self.recipe.loss, self.recipe.knee, joints, truth, which_count(batch))}
 
     def poses(self, batch: Batch) -> Tensor:
         """The poses (B, J, 3) that the network has to predict for these samples. The prior is fitted to them."""
@@ -85,7 +85,7 @@ class DenseObjective(PoseObjective):
             truth: joints (B, J, 3) in the units of the answer.
             scale: one such unit in cube units, (B,) or (). A view of the second look has its own units.
         """
-        counts, half = joints_count(batch), batch['cube_side'] / 2 * scale
+        counts, half = which_count(batch), batch['cube_side'] / 2 * scale
         joints, refined = out['joints'].float(), out['unrefined'] is not out['joints']
         directions, closeness = encode(out['positions'], truth)
         seen = out['seen']  # (B, 1, 32, 32)
@@ -203,7 +203,7 @@ class RefinerObjective(nn.Module):
         for i in range(self.ITERATIONS):
             estimate = self.refiner(batch['patch'], estimate, iterations=1).float()
             terms[f'joints_{i + 1}'] = joint_loss(
-                self.recipe.loss, self.recipe.knee, estimate, batch['joints'], joints_count(batch))
+                self.recipe.loss, self.recipe.knee, estimate, batch['joints'], which_count(batch))
         return terms
 
     def predict(self, patch: Tensor) -> Tensor:
@@ -230,7 +230,7 @@ def chosen(joints: Tensor, which: list[int]) -> Tensor:
     return torch.stack([joints[:, joint] for joint in which], dim=1)
 
 
-def joints_count(batch: Batch) -> Tensor:
+def which_count(batch: Batch) -> Tensor:
     """The samples whose joints count, (B,) bool. They show a hand, and are not mirrored."""
     return batch['hand_present'] & ~batch['mirrored']
 

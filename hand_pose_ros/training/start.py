@@ -19,7 +19,7 @@ from hand_pose_ros.models.two_looks import TwoLooks
 from hand_pose_ros.runtime import NO_JOINTS
 from hand_pose_ros.skeleton import Skeleton
 from hand_pose_ros.training.augmentation import PRESETS, augment
-from hand_pose_ros.training.objectives import PoseObjective, RefinerObjective, joints_count, objective_for
+from hand_pose_ros.training.objectives import PoseObjective, RefinerObjective, objective_for, which_count
 from hand_pose_ros.training.recipes import Recipe
 
 log = logging.getLogger(__name__)
@@ -176,4 +176,4 @@ def _training_poses(objective: PoseObjective, shards: DiskShards | MemoryShards,
     turns = max(1, min(8, 16_384 // count))
     numbers = torch.arange(turns * count).split(count)
     batches = [augment(samples, recipe.augmentation, some, recipe.seed) for some in numbers]
-    return torch.cat([objective.poses(batch)[joints_count(batch)] for batch in batches])
+    return torch.cat([objective.poses(batch)[which_count(batch)] for batch in batches])

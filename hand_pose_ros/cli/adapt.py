@@ -68,10 +68,9 @@ def run(args: argparse.Namespace) -> int:
     from hand_pose_ros.datasets.memory import keep_freed_memory
     from hand_pose_ros.datasets.shards import make_shard
     from hand_pose_ros.evaluation.bag_evaluation import Settings
-    from hand_pose_ros.evaluation.tables import number, text_table
     from hand_pose_ros.models.checkpoints import DEFAULT, load_checkpoint, save_checkpoint
     from hand_pose_ros.runtime import make_engine
-    from hand_pose_ros.training.adapt import fine_tune, is_better, judge, label, look, require_hands
+    from hand_pose_ros.training.adapt import fine_tune, judge, label, look, require_hands
     from hand_pose_ros.training.validation import estimate
 
     keep_freed_memory()
@@ -103,18 +102,27 @@ def run(args: argparse.Namespace) -> int:
     test = [make_shard(open_dataset('synthetic', 'test'), 0, CHECKED)]
     errors = [1000 * float((joints - truth).norm(dim=-1).mean()) for joints, truth in
               (estimate(each, test, torch.device('cpu')) for each in (checkpoint.network, network))]
-    metadata['adapted'] = {'from': str(name), 'bag': args.bag.name, 'images': len(labelled['patch']),
-                           'steps': args.steps, 'before': before, 'after': after, 'synthetic_test_v1_mm': errors}
-    save_checkpoint(args.out, network, metadata)
+    adapted = {'from': name, 'bag': args.bag.name, 'images': len(labelled['patch']), 'steps': args.steps,
+               'before': before, 'after': after, 'synthetic_test_v1_mm': errors}
+    save_checkpoint(args.out, network, {**metadata, 'adapted': adapted})
+    print(f'\n{len(labelled["patch"])} images were learned from; held out were the last '
+          f'{int(found.split()[1].sum())} of {len(found.result.predictions)}.\n')
+    _tell(args.out, adapted)
+    return 0
 
+
+def _tell(out: Path, adapted: dict[str, Any]) -> None:
+    """Print the numbers before and after, and which weights to use."""
+    from hand_pose_ros.evaluation.tables import number, text_table
+    from hand_pose_ros.training.adapt import is_better
+
+    name, before, after, errors = (adapted[key] for key in ('from', 'before', 'after', 'synthetic_test_v1_mm'))
     rows: list[tuple[str, ...]] = [
         (title, number(before[key], 1, '', factor), number(after[key], 1, '', factor))
         for key, (title, factor) in ROWS.items() if before[key] is not None]
     rows.append((f'synthetic-test-v1, first {CHECKED} frames, mm', *(number(error, 1) for error in errors)))
-    print(f'\n{len(labelled["patch"])} images were learned from; held out were the last '
-          f'{int(found.split()[1].sum())} of {len(found.result.predictions)}.\n')
     print(text_table(('', 'before', 'after'), rows))
-    print(f'\nWritten to {args.out}; use them with --model {args.out}.')
+    print(f'\nWritten to {out}; use them with --model {out}.')
     if errors[1] > WORSE * errors[0]:
         print(f'WARNING: on synthetic-test-v1 the adapted weights are worse ({errors[0]:.2f} mm before, '
               f'{errors[1]:.2f} mm after): for other hands and cameras use {name}.')
@@ -124,7 +132,6 @@ def run(args: argparse.Namespace) -> int:
         print('The adapted weights agree better with themselves and with the depth on the held-out images. Whether '
               'they are more accurate only labels could tell (--ground-truth): look at the pictures of '
               '`hand-pose estimate --overlay` before and after.')
-    return 0
 
 
 def _check_fits(checkpoint: Checkpoint, name: str) -> None:

@@ -29,7 +29,7 @@ def test_a_gpu_without_enough_memory_is_told(arguments, remedy, monkeypatch, tmp
     def full(device):
         raise torch.cuda.OutOfMemoryError('CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has 1 GiB.')
     monkeypatch.chdir(tmp_path)
-    for where in ('training.loop', 'training.distributed', 'runtime'):  # whose function the others import, so last
+    for where in ('cli.synth', 'training.loop', 'training.distributed'):
         monkeypatch.setattr(f'hand_pose_ros.{where}.check_device', full)
     assert main([*arguments, '--device', 'cuda']) == 1
     said = capsys.readouterr().err

@@ -5,18 +5,30 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from tqdm import tqdm
+
+from hand_pose_ros.bags import BagWriter
 from hand_pose_ros.cli.arguments import count, none_or_more
+from hand_pose_ros.drawing import FINGER_COLORS, Picture, caption, contact_sheet
 from hand_pose_ros.errors import HandPoseError, counted
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-    from torch import Tensor
-
-    from hand_pose_ros.drawing import Picture
-    from hand_pose_ros.synthetic.generator import SyntheticHands
+from hand_pose_ros.evaluation.tables import text_table
+from hand_pose_ros.files import in_one_step, write_bytes
+from hand_pose_ros.geometry import Cube
+from hand_pose_ros.hand import HandEstimate
+from hand_pose_ros.runtime import check_device
+from hand_pose_ros.skeleton import HAND21
+from hand_pose_ros.synthetic.generator import LEFT, SyntheticHands
+from hand_pose_ros.synthetic.rig import Rig
+from hand_pose_ros.synthetic.sensors import SENSORS
+from hand_pose_ros.synthetic.stages import Ingredients
+from hand_pose_ros.synthetic.statistics import real_patches, summarise
 
 DESCRIPTION = 'Make or show synthetic hands, seen by simulated depth sensors: the networks are trained on these.'
 
@@ -34,7 +46,6 @@ _ZOOM = 2
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the verb takes."""
-    from hand_pose_ros.synthetic.sensors import SENSORS  # imports torch
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument('--split', default='train', choices=('train', 'val', 'test'),
                         help='which hands, poses and seeds (train)')
@@ -81,18 +92,14 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _hands(args: argparse.Namespace, sensors: list[str] | None, **options: Any) -> SyntheticHands:
-    from hand_pose_ros.synthetic.generator import SyntheticHands
-    from hand_pose_ros.synthetic.rig import Rig
     return SyntheticHands(args.split, sensors=sensors, hand=Rig(args.rig) if args.rig else None, **options)
 
 
 def _indices(args: argparse.Namespace, step: int) -> tuple[Tensor, ...]:
-    import torch
     return torch.arange(args.start, args.start + args.number).split(step)
 
 
 def _real(args: argparse.Namespace) -> Iterator[tuple[str, list[tuple[NDArray[np.float32], float]]]]:
-    from hand_pose_ros.synthetic.statistics import real_patches
     for folder, *numbers in args.real:
         try:
             *intrinsics, scale = map(float, numbers)
@@ -102,15 +109,6 @@ def _real(args: argparse.Namespace) -> Iterator[tuple[str, list[tuple[NDArray[np
 
 
 def _show(args: argparse.Namespace) -> None:
-    import cv2
-    import torch
-
-    from hand_pose_ros.drawing import contact_sheet
-    from hand_pose_ros.files import write_bytes
-    from hand_pose_ros.synthetic.generator import LEFT
-    from hand_pose_ros.synthetic.sensors import SENSORS
-    from hand_pose_ros.synthetic.stages import Ingredients
-
     if not cv2.haveImageWriter(str(args.out)):
         raise HandPoseError(f'{args.out}: pictures of this kind cannot be written: give a name that ends in .png')
     names = args.sensors or [sensor.name for sensor in SENSORS]
@@ -138,10 +136,6 @@ def _show(args: argparse.Namespace) -> None:
 
 def _relief(patch: NDArray[np.float32], label: str) -> Picture:
     """A patch as a surface that is lit from the upper left. Nothing smooths it, so its noise can be judged."""
-    import numpy as np
-
-    from hand_pose_ros.drawing import caption
-
     slope_y, slope_x = np.gradient(patch * (len(patch) / 2))
     light = (0.4 * slope_x + 0.5 * slope_y + 0.77) / np.sqrt(slope_x ** 2 + slope_y ** 2 + 1)
     shade = np.clip(light, 0, 1) * 0.75 + 0.125 * (1 - patch)
@@ -152,10 +146,6 @@ def _relief(patch: NDArray[np.float32], label: str) -> Picture:
 
 
 def _draw_joints(picture: Picture, joints: NDArray[np.float32], visible: NDArray[np.bool_]) -> None:
-    import cv2
-
-    from hand_pose_ros.drawing import FINGER_COLORS
-    from hand_pose_ros.skeleton import HAND21
     at = ((joints[:, :2] + 1) * (len(picture) / 2)).round().astype(int).tolist()
     colors = [FINGER_COLORS[finger][::-1] for finger in HAND21.fingers]
     for parent, child in HAND21.bones:
@@ -165,12 +155,6 @@ def _draw_joints(picture: Picture, joints: NDArray[np.float32], visible: NDArray
 
 
 def _write(args: argparse.Namespace) -> None:
-    import numpy as np
-    from tqdm import tqdm
-
-    from hand_pose_ros.files import in_one_step
-    from hand_pose_ros.runtime import check_device
-
     check_device(args.device)
     hands = _hands(args, args.sensors, device=args.device)
     args.out.mkdir(parents=True, exist_ok=True)
@@ -185,14 +169,6 @@ def _write(args: argparse.Namespace) -> None:
 
 def _record(args: argparse.Namespace) -> None:
     """Depth with camera_info, as a camera publishes them, and the truth on a topic of its own."""
-    import numpy as np
-    from tqdm import tqdm
-
-    from hand_pose_ros.bags import BagWriter
-    from hand_pose_ros.geometry import Cube
-    from hand_pose_ros.hand import HandEstimate
-    from hand_pose_ros.skeleton import HAND21
-
     sequence = _hands(args, args.sensors).sequence(args.start, args.number)
     with BagWriter(args.out) as bag:
         images = tqdm(sequence, total=args.number, unit='images', disable=None)
@@ -207,9 +183,6 @@ def _record(args: argparse.Namespace) -> None:
 
 
 def _stats(args: argparse.Namespace) -> None:
-    from hand_pose_ros.evaluation.tables import text_table
-    from hand_pose_ros.synthetic.statistics import summarise
-
     columns = {f'real {name}': summarise(patches) for name, patches in _real(args)}
     hands, patches = _hands(args, args.sensors), []
     for indices in _indices(args, 64):

@@ -80,13 +80,11 @@ def runtime(rows: Mapping[str, Mapping[str, float]], paper_ms: Mapping[str, tupl
 @matplotlib.rc_context(STYLE)
 def qualitative(result: Result, batches: Sequence[Batch], rows: NDArray[np.int64]) -> Figure:
     """A column for each frame. It shows the patch, and its points from the side, with the estimate and the truth."""
-    present = torch.cat([batch['hand_present'] for batch in batches]).nonzero()[:, 0]
-    whole = {key: torch.cat([batch[key] for batch in batches]) for key in ('cube_center', 'cube_side')}
+    frames = [(batch, k) for batch in batches for k in batch['hand_present'].nonzero()[:, 0].tolist()]
     figure = Figure((2.7 * len(rows), 5.8), layout='constrained')
     for column, axes in zip(rows, figure.subplots(2, len(rows)).T, strict=True):
-        number = int(present[column])
-        center, side = whole['cube_center'][number], whole['cube_side'][number]
-        patch = _patch(batches, number)
+        batch, k = frames[column]
+        center, side, patch = batch['cube_center'][k], batch['cube_side'][k], batch['patch'][k, 0].float()
         assert result.truth is not None
         skeletons = [(result.truth[column], TRUTH, 'truth'), (result.predictions[column], ESTIMATE, 'estimate')]
         cloud = _points(patch, center, side)
@@ -96,22 +94,14 @@ def qualitative(result: Result, batches: Sequence[Batch], rows: NDArray[np.int64
                          vmax=float(center[2] + side))
             for joints, color, name in skeletons:
                 flat = _turned(torch.from_numpy(joints).float(), center, turn)
-                for k, bone in enumerate(result.skeleton.bones):
-                    view.plot(*flat[list(bone)].T, color=color, lw=1.4, alpha=0.9, label=None if k else name)
+                for i, bone in enumerate(result.skeleton.bones):
+                    view.plot(*flat[list(bone)].T, color=color, lw=1.4, alpha=0.9, label=None if i else name)
             reach = float(side) / 2
             view.set(xlim=(-reach, reach), ylim=(reach, -reach), aspect='equal', xticks=[], yticks=[])
         axes[0].set_title(f'{result.errors_mm[column].mean():.0f} mm')
         axes[1].set_title('from the side', fontsize=9)
     figure.axes[0].legend(fontsize=8, loc='lower left')
     return figure
-
-
-def _patch(batches: Sequence[Batch], number: int) -> torch.Tensor:
-    for batch in batches:
-        if number < len(batch['patch']):
-            return batch['patch'][number, 0].float()
-        number -= len(batch['patch'])
-    raise IndexError(number)
 
 
 def _points(patch: torch.Tensor, center: torch.Tensor, side: torch.Tensor) -> torch.Tensor:

@@ -27,7 +27,7 @@ from hand_pose_ros.conventions import (
 from hand_pose_ros.depth import DEPTH_ENCODINGS, decode_compressed, decode_image
 from hand_pose_ros.errors import InputError, naming
 from hand_pose_ros.geometry import Intrinsics
-from hand_pose_ros.hand import side_of
+from hand_pose_ros.hand import Side, side_of
 from hand_pose_ros.skeleton import SKELETONS
 
 
@@ -205,7 +205,7 @@ class RecordedHands:
     joints: NDArray[np.float64]
     confidence: NDArray[np.float32]
     scores: NDArray[np.float32]
-    sides: tuple[str, ...]
+    sides: tuple[Side, ...]
     ids: tuple[str, ...]
 
 

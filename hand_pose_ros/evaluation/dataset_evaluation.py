@@ -16,7 +16,7 @@ from hand_pose_ros.models.checkpoints import DEFAULT, load_checkpoint
 from hand_pose_ros.runtime import make_engine
 
 
-def evaluate_dataset(name: str, root: Path | None, model: str | None = None, split: str = 'test', device: str = 'auto',
+def evaluate_dataset(name: str, root: Path, model: str | None = None, split: str = 'test', device: str = 'auto',
                      progress: Progress = silent) -> Result:
     """The joints of all frames of a split. The crops start from the labels (original code).
 

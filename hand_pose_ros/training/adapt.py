@@ -82,7 +82,7 @@ class Look:
     rows: Tensor
     crops: Batch
 
-    def select(self, chosen: NDArray[np.bool_] | Tensor) -> tuple[Tensor, Batch]:
+    def select(self, chosen: NDArray[np.bool_]) -> tuple[Tensor, Batch]:
         """Rows and crops of the chosen images (a bool for each image), at most `MOST`. Patches are float32."""
         index = torch.as_tensor(chosen)[self.rows].nonzero()[:, 0]
         index = index[torch.linspace(0, len(index) - 1, min(len(index), MOST)).round().long()]

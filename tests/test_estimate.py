@@ -199,7 +199,9 @@ def test_markers_are_in_the_bag_without_ros(tmp_path, depths, weights, monkeypat
 def test_images_without_a_hand_are_answered_too(tmp_path, bag, weights, capsys):
     args = ['estimate', str(bag), '--model', str(weights), '--min-score', '1']
     assert main([*args, '--out', str(tmp_path / 'a.mcap')]) == main([*args, '--out', str(tmp_path / 'a.npz')]) == 0
-    assert 'nothing had a score of 1 or more' in capsys.readouterr().err
+    assert 'nothing had a score of 1 or more, which networks' in capsys.readouterr().err
+    assert main([*args, '--side', 'left', '--out', str(tmp_path / 'a.npz')]) == 0
+    assert 'as a left hand: if it may be the other hand, leave out --side' in capsys.readouterr().err
     assert [len(record.joints) for record in read_hands(tmp_path / 'a.mcap')] == [0] * 6
     result = np.load(tmp_path / 'a.npz')
     assert result['joints'].shape == (0, 21, 3) and result['stamp_ns'].tolist() == STAMPS

@@ -147,8 +147,10 @@ def estimate(images: Iterator[DepthInput], number: int, estimator: HandPoseEstim
     print(f'{counted(done, "images")}, {found} with a hand, {failed} that could not be used; '
           f'{1000 * float(np.median(seconds)):.1f} ms for the median image')
     if not found:
-        hint = (f'nothing had a score of {estimator.min_score:g} or more, which networks with little training do not '
-                'reach: --min-score 0 shows what is most like a hand')
+        hint = f'nothing had a score of {estimator.min_score:g} or more'
+        hint += ', which networks with little training do not reach' if estimator.side == 'auto' else \
+            f' as a {estimator.side} hand: if it may be the other hand, leave out --side'
+        hint += ': --min-score 0 shows what is most like a hand'
         print(f'hand-pose estimate: {problem or hint}', file=sys.stderr)
     return 1 if failed else 0
 

@@ -182,7 +182,8 @@ def test_truth_that_does_not_fit_is_refused(tmp_path, bag, model, result, capsys
             (tmp_path / 'none.npz', 'joints has no labels'), (tmp_path / 'one.npz', 'the truth has the shape ()'),
             (tmp_path / 'array.npz', 'array joints'),
             ('/truth/joints', 'no hand_pose_ros/HandJointsArray on /truth/joints: choose another bag'),
-            ('truth.csv', 'no such file'), (tmp_path / 'lost.npz', 'no such file')):
+            (bag, 'ball.mcap: this is a bag: give a topic'), ('truth.csv', 'no such file'),
+            (tmp_path / 'lost.npz', 'no such file')):
         assert main(arguments(bag, model, '--ground-truth', source)) == 1
         assert message in capsys.readouterr().err
     monkeypatch.setattr(HandPoseEstimator, '__call__', lambda *_, **__: pytest.fail('what is wrong is told first'))

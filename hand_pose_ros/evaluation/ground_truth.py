@@ -95,6 +95,8 @@ def _read(source: str, bag: str | Path, skeleton: Skeleton) -> Truth:
             raise InputError(f'{source}: there is no such file, and it is no topic either, which begins with / and has '
                              'no dot')
         return _read_topic(source, bag, skeleton)
+    if Path(source).suffix in ('.bag', '.mcap', '.db3'):
+        raise InputError(f'{source}: this is a bag: give a topic of the bag with the images, or an .npz or text file')
     if Path(source).suffix != '.npz':
         return Truth(source, read_text(source, skeleton))
     try:

@@ -251,7 +251,7 @@ def test_incompatible_quality_of_service_is_named_with_its_remedy(rig: Rig, monk
     rig.until_said('does not offer', '/depth/image_rect', '/client', 'best effort',
                    '-p qos_overrides./depth/image_rect.subscription.reliability:=best_effort')
     monkeypatch.setattr(node_module, 'SILENCE_S', 0.1)
-    # In the diagnostics, too, as long as it lasts, whatever arrives beside the images.
+    # In the diagnostics, too, as long as it lasts, whatever arrives beside the images: none of them are lost.
     infos = rig.client.create_publisher(CameraInfo, 'depth/camera_info', RELIABLE)
 
     def told() -> bool:

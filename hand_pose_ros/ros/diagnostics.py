@@ -110,7 +110,7 @@ class Statistics:
         Args:
             node: its name.
             state: of the node, for example `active`.
-            published: whether the image topic has a publisher. Without one, no images can be lost on the way.
+            published: whether anybody publishes images that can arrive. If not, none are lost on the way.
             facts: more keys and values.
         """
         with self._lock:

@@ -82,7 +82,7 @@ class EstimatorNode(LifecycleNode):
         self._worker: NewestWorker[Image | CompressedImage] | None = None
         self._inputs: list[Subscription] = []
         self._latched: Subscription | None = None  # to a camera_info that was published before the node came
-        self._published = False  # whether anybody publishes images
+        self._published = False  # whether anybody publishes images that can arrive
         self._info_stamp = -1  # of the newest camera_info, ns
         self._last_header = Header()  # of the image before
         self._reset = False  # a reset was requested; the worker does it, since only the worker uses the estimator
@@ -249,7 +249,7 @@ class EstimatorNode(LifecycleNode):
 
     def _on_timer(self) -> None:
         listening = self._worker is not None
-        published = listening and self.count_publishers(self._image_topic) > 0
+        published = listening and topics.can_arrive(self, self._image_topic, self._image_type)
         if published and not self._published:  # a publisher that has just started, such as a bag, may take time
             self._heard_at, self._statistics.silence = time.monotonic(), ''
         self._published = published

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from rclpy.exceptions import ParameterException
@@ -93,6 +93,27 @@ def _name(publisher: TopicEndpointInfo) -> str:
     return f'{publisher.node_namespace.rstrip("/")}/{publisher.node_name}'
 
 
+def can_arrive(node: Node, topic: str, message_type: type) -> bool:
+    """Whether anybody publishes what the node listens to: messages of this type, as reliably as it asks for them."""
+    fitting = _of_type(node, topic, message_type)
+    return bool(fitting) and not _too_unreliable(node, topic, fitting)
+
+
+def _of_type(node: Node, topic: str, message_type: type) -> list[TopicEndpointInfo]:
+    return [info for info in node.get_publishers_info_by_topic(topic) if info.topic_type == _type_name(message_type)]
+
+
+def _type_name(message_type: type) -> str:
+    return f'sensor_msgs/msg/{message_type.__name__}'
+
+
+def _too_unreliable(node: Node, topic: str, publishers: Sequence[TopicEndpointInfo]) -> bool:
+    """Whether the node listens reliably, but none of these publishers is reliable."""
+    wanted = QoSReliabilityPolicy.RELIABLE
+    return all(info.qos_profile.reliability != wanted for info in publishers) and any(
+        listener.topic_name == topic and listener.qos_profile.reliability == wanted for listener in node.subscriptions)
+
+
 def explain_silence(node: Node, topic: str, message_type: type, seconds: float) -> str:
     """Why no image may have arrived for some seconds, and what to do.
 
@@ -101,10 +122,9 @@ def explain_silence(node: Node, topic: str, message_type: type, seconds: float) 
         message_type: the type that is expected on it.
         seconds: how long no image has arrived.
     """
-    topic_type = f'sensor_msgs/msg/{message_type.__name__}'
+    topic_type = _type_name(message_type)
     said = f'no image arrived on {topic} for {seconds:.0f} s; the topic is {describe_publishers(node, topic)}'
-    infos = node.get_publishers_info_by_topic(topic)
-    right_type = any(info.topic_type == topic_type for info in infos)
+    infos, fitting = node.get_publishers_info_by_topic(topic), _of_type(node, topic, message_type)
     image, _ = split_transport(topic)
     if not infos:
         for transport in TRANSPORTS:
@@ -113,19 +133,16 @@ def explain_silence(node: Node, topic: str, message_type: type, seconds: float) 
                 return (f'{said}, but depth is published on {other}: set the parameter transport to {transport} '
                         f'(at the start: --ros-args -p transport:={transport})')
     zstd = f'{image.removesuffix(f"/{ZSTD}")}/{ZSTD}'
-    if not right_type and node.count_publishers(zstd):
+    if not fitting and node.count_publishers(zstd):
         return f'{said}, but on {zstd} there are images: {ZSTD_REMEDY}'
     if not infos:
         ours = {topic, *(publisher.topic_name for publisher in node.publishers)}
         others = [name for name, types in node.get_topic_names_and_types() if topic_type in types and name not in ours]
         where = f' ({topic_type} is published on {", ".join(others)})' if others else ''
         return f'{said}{where}: start the camera, or name its topic with --ros-args -r {IMAGE}:=/its/topic'
-    if not right_type:
+    if not fitting:
         return f'{said}, but {topic_type} is expected: remap {IMAGE}, or set the parameter transport'
-    wanted = QoSReliabilityPolicy.RELIABLE
-    if all(info.qos_profile.reliability != wanted for info in infos) and any(
-            listener.topic_name == topic and listener.qos_profile.reliability == wanted
-            for listener in node.subscriptions):
+    if _too_unreliable(node, topic, fitting):
         return explain_incompatible(node, topic, 'reliability')
     return f'{said}: if it does publish, {remedy_for_lost_images()}'
 

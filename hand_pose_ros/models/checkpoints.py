@@ -24,6 +24,7 @@ from hand_pose_ros.skeleton import get_skeleton
 
 WEIGHTS = Path(__file__).resolve().parents[1] / 'weights'
 DEFAULT = 'hand_dense'
+_AGAIN = 'copy or download it again, or write it again with save_checkpoint'
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,7 @@ def load_checkpoint(name_or_path: str | PathLike[str] | None = None) -> Checkpoi
         joints = part.get('config', {}).get('joints')
         if joints not in (None, len(skeleton)):
             raise CheckpointError(f"checkpoint {path} predicts {joints} joints, "
-                                  f"but its skeleton '{skeleton.name}' has {len(skeleton)}")
+                                  f"but its skeleton '{skeleton.name}' has {len(skeleton)}: {_AGAIN}")
     return Checkpoint(network, refiner, metadata)
 
 
@@ -145,10 +146,10 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         metadata = json.loads(header['hand_pose_ros'])
         missing = {'architecture', 'config', 'skeleton', 'cube_side', 'version'} - metadata.keys()
     except (KeyError, ValueError, AttributeError) as error:
-        raise CheckpointError(f'{path} was not written by hand_pose_ros: it does not say which network '
-                              'its weights belong to') from error
+        raise CheckpointError(f'{path} was not written by hand_pose_ros and does not say which network its weights '
+                              'belong to: give weights of `hand-pose train` or save_checkpoint') from error
     if missing:
-        raise CheckpointError(f"checkpoint {path} does not say its {', '.join(sorted(missing))}")
+        raise CheckpointError(f"checkpoint {path} does not say its {', '.join(sorted(missing))}: {_AGAIN}")
     if not (isinstance(metadata['cube_side'], int | float) and 0 < metadata['cube_side'] < math.inf):
         raise CheckpointError(f"checkpoint {path}: its cube_side is {metadata['cube_side']!r:.80}, where metres "
                               'belong: write it again with save_checkpoint')
@@ -166,13 +167,13 @@ def _restore(path: Path, part: str, description: dict[str, Any], tensors: dict[s
     expected = network.state_dict()
     for name, tensor in expected.items():
         if name not in own:
-            raise CheckpointError(f"checkpoint {path} lacks the weights '{name}' of its {part}")
+            raise CheckpointError(f"checkpoint {path} lacks the weights '{name}' of its {part}: {_AGAIN}")
         if own[name].shape != tensor.shape:
-            raise CheckpointError(f"checkpoint {path} holds '{name}' of its {part} as "
-                                  f'{tuple(own[name].shape)} instead of {tuple(tensor.shape)}')
+            raise CheckpointError(f"checkpoint {path} holds '{name}' of its {part} as {tuple(own[name].shape)} "
+                                  f'instead of {tuple(tensor.shape)}: {_AGAIN}')
         if not own[name].isfinite().all():
-            raise CheckpointError(f"checkpoint {path} is damaged: '{name}' of its {part} is not finite")
+            raise CheckpointError(f"checkpoint {path} is damaged: '{name}' of its {part} is not finite: {_AGAIN}")
     if unknown := own.keys() - expected.keys():
-        raise CheckpointError(f"checkpoint {path} holds '{min(unknown)}', which its {part} has no place for")
+        raise CheckpointError(f"checkpoint {path} holds '{min(unknown)}', which its {part} has no place for: {_AGAIN}")
     network.load_state_dict(own)  # copies into float32
     return network.requires_grad_(False).eval()

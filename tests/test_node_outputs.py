@@ -302,7 +302,9 @@ def test_hands_are_looked_for_in_the_region_that_is_given(rig: Rig) -> None:
     assert x > 0.1
     [x] = found(RegionOfInterest(width=half, height=HEIGHT))
     assert x < -0.1
-    assert found(RegionOfInterest()) == []
+    assert found(RegionOfInterest()) == [] and not any('begins at' in text for text in rig.said())
+    assert found(RegionOfInterest(x_offset=WIDTH, width=half, height=HEIGHT)) == []
+    rig.until_said(f'the region on /where/hands/are begins at pixel ({WIDTH}, 0), outside of the image')
     assert found(RegionOfInterest(x_offset=2**32 - 1, y_offset=2**32 - 1, width=2**32 - 1, height=2**32 - 1)) == []
     assert len(found(RegionOfInterest(width=2**32 - 1, height=2**32 - 1))) == 2
     for enabled in (False, True):  # the newest holds until the next, also then

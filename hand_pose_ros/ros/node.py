@@ -342,7 +342,8 @@ class EstimatorNode(LifecycleNode):
         if hands:
             self._right_scale = params.depth_scale
             return hands
-        problem = topics.explain_no_region(self) if regions == [] else depth_problem(
+        problem = '' if regions is None else topics.region_problem(self, regions, depth.shape[1], depth.shape[0])
+        problem = problem or depth_problem(
             depth, params.min_depth, params.max_depth, params.depth_scale == self._right_scale)
         if problem:
             self._complain(f'{self._image_topic}: {problem}')

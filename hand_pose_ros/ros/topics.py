@@ -13,6 +13,7 @@ from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from hand_pose_ros.conventions import TRANSPORTS, ZSTD, ZSTD_REMEDY, camera_info_beside, join_transport, split_transport
+from hand_pose_ros.detection import Region
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.ros import qos
 
@@ -147,10 +148,19 @@ def explain_silence(node: Node, topic: str, message_type: type, seconds: float) 
     return f'{said}: if it does publish, {remedy_for_lost_images()}'
 
 
-def explain_no_region(node: Node) -> str:
-    """Why the node looks for no hand with the detector `region`, and what to do."""
-    return (f'no region arrived on {node.resolve_topic_name(REGION)}, so no hand is looked for: publish where it is in '
-            'the depth image, or set the parameter detector to network')
+def region_problem(node: Node, regions: Sequence[Region], width: int, height: int) -> str:
+    """Why the detector `region` looks for no hand in images of this size, and what to do. Empty if it does look, or if
+    a region says that there is no hand.
+    """
+    topic = node.resolve_topic_name(REGION)
+    if not regions:
+        return (f'no region arrived on {topic}, so no hand is looked for: publish where it is in the depth image, or '
+                'set the parameter detector to network')
+    left, top, across, down = regions[0]
+    if across and down and (left >= width or top >= height):
+        return (f'the region on {topic} begins at pixel ({left}, {top}), outside of the image of {width}x{height}: '
+                'give it in pixels of the depth image')
+    return ''
 
 
 def remedy_for_lost_images() -> str:

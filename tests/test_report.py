@@ -423,7 +423,7 @@ def test_compare_refuses_what_cannot_be_compared(result, tmp_path, capsys):
     Result('blind', HAND21, CAMERA, result.predictions).save(tmp_path / 'blind.npz')
     a, short, blind = (str(tmp_path / f'{name}.npz') for name in ('a', 'short', 'blind'))
     assert main(['compare', a, short]) == 0
-    assert 'have 40 and 9 frames: no interval' in capsys.readouterr().err
+    assert f'short and {result.name} have 9 and 40 frames: no interval' in capsys.readouterr().err
     replace(result, truth=result.truth + 0.01).save(tmp_path / 'other.npz')
     assert main(['compare', a, str(tmp_path / 'other.npz')]) == 0
     assert 'were evaluated on different truth: no interval' in capsys.readouterr().err

@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     print_summaries(zip((result.name for result in results), summaries, strict=True))
     first, differences = results[0], []
     for other in results[1:]:
-        reason = _not_paired(first, other)
+        reason = _not_paired(other, first)
         if reason:
             print(f'NOTE: {other.name} and {first.name} {reason}: no interval for their difference', file=sys.stderr)
             continue

@@ -73,9 +73,10 @@ def test_a_file_of_one_sequence_is_matched_to_it_and_says_so(shared_data, capsys
           '--ground-truth', str(folder / 'groundtruth.txt.gz')])
     assert 'NOTE: DeepPrior.txt.gz has 702 frames, as many as sequence 1' in capsys.readouterr().err
     exact = load_published(folder / 'DeepPrior.txt.gz', folder / 'test_seq_1.txt.gz', ICVL)
-    assert not exact.notes and np.array_equal(exact.truth, whole.truth)
+    assert not exact.notes and np.array_equal(exact.truth, whole.truth) and exact.in_time
     second = load_published(folder / 'LRF.txt.gz', folder / 'test_seq_2.txt.gz', ICVL)
     assert second.summary()['mean_mm'] == pytest.approx(12.537, abs=6e-4), 'the truth may be the shorter one'
+    assert 'test_seq_2.txt.gz has 894 frames' in second.notes[0] and 'rows 703-1596 of LRF.txt.gz' in second.notes[0]
     with pytest.raises(InputError, match=r'702 frames but .* 894'):
         load_published(folder / 'DeepPrior.txt.gz', folder / 'test_seq_2.txt.gz', ICVL)
 
@@ -137,10 +138,10 @@ def test_names_on_both_sides_decide_what_belongs_together(tmp_path, uvd):
     assert result.summary()['jitter_mm'] is None
     backwards = load_published(write_uvd(tmp_path / 'b.txt', uvd[::-1], names[::-1]), truth, NYU)
     np.testing.assert_allclose(backwards.predictions, load_published(truth, truth, NYU).predictions)
-    assert backwards.in_time
+    assert backwards.in_time and not backwards.notes
     with pytest.raises(InputError, match=r"'9\.png' is not in"):
         load_published(write_uvd(tmp_path / 'q.txt', uvd[:1], ['9.png']), truth, NYU)
-    twice = write_uvd(tmp_path / 'q.txt', uvd[:2], ['1.png'] * 2)
+    twice = write_uvd(tmp_path / 'q.txt', uvd[:3], ['0.png', '1.png', '1.png'])
     for both in (twice, truth), (truth, twice):
         with pytest.raises(InputError, match=r"q\.txt: the file name '1\.png' stands on two lines"):
             load_published(*both, NYU)
@@ -164,6 +165,9 @@ def test_wrong_counts_joints_and_units_are_refused(tmp_path, uvd, capsys):
     truth = write_uvd(tmp_path / 'g.txt', uvd)
     with pytest.raises(InputError, match=r'4 frames but .* has 5.*2440 \(subject 1\)'):
         load_published(write_uvd(tmp_path / 'p.txt', uvd[:4]), truth, NYU)
+    many = np.tile(uvd, (1, 2, 1))[:, :21]
+    with pytest.raises(InputError, match=r'give files of the same length$'):  # MSRA has no parts
+        load_published(write_uvd(tmp_path / 'p.txt', many[:4]), write_uvd(tmp_path / 'q.txt', many), DATASETS['msra'])
     with pytest.raises(InputError, match='line 1 has 42 numbers, but the 16 joints of icvl16'):
         read_text(truth, ICVL.skeleton)
     with pytest.raises(InputError, match='looks like metres'):

@@ -45,11 +45,12 @@ def result():
 
 
 def depth_images(result):
-    """A disc of 3 cm around each true joint, before a wall."""
+    """A disc of 3 cm around each true joint, before a wall, and something beside the hand."""
     def read(rows):
         images = {}
         for row in rows:
             image = np.full((240, 320), 0.75, np.float32)
+            image[:, :12] = 0.5
             for (u, v), (_, _, z) in zip(CAMERA.project(result.truth[row]), result.truth[row], strict=True):
                 cv2.circle(image, (round(u), round(v)), 12, float(z), -1)
             images[row] = image
@@ -446,8 +447,9 @@ def test_compare_refuses_what_cannot_be_compared(result, tmp_path, capsys):
     assert main(['compare', a, str(tmp_path / 'predictions.txt')]) == 1
     assert 'predictions.txt: there is no such file' in capsys.readouterr().err
     (tmp_path / 'predictions.txt').touch()
-    assert main(['compare', a, str(tmp_path / 'predictions.txt')]) == 1
-    assert 'need --ground-truth and --dataset' in capsys.readouterr().err
+    for half in ([], ['--dataset', 'nyu'], ['--ground-truth', str(tmp_path / 'predictions.txt')]):
+        assert main(['compare', a, str(tmp_path / 'predictions.txt'), *half]) == 1
+        assert 'need --ground-truth and --dataset' in capsys.readouterr().err
     with pytest.raises(SystemExit) as caught:
         main(['compare', a])
     assert caught.value.code == 2

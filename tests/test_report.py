@@ -236,11 +236,13 @@ def test_images_without_a_time_of_their_own_are_drawn_in_order(result, stamps):
         assert axes.get_xlim() == (1, 40) and axes.get_xlabel() == 'frame'
 
 
-def test_the_time_of_a_single_image_is_drawn(result):
+def test_the_time_of_a_single_image_is_drawn(result, tmp_path):
     one = replace(result, predictions=result.predictions[:1], truth=result.truth[:1], stamps_ns=result.stamps_ns[:1],
                   seconds={stage: seconds[:1] for stage, seconds in result.seconds.items()})
     image = cv2.imdecode(np.frombuffer(plots.to_bytes(plots.latency(one), 'png'), np.uint8), 1)
     assert (np.abs(image.astype(int) - [178, 114, 0]).max(-1) < 40).mean() > 0.4
+    write_report([one], tmp_path)
+    assert not (tmp_path / 'errors.svg').exists(), 'one frame is no line over time'
 
 
 @pytest.mark.parametrize('frames', [200, 2000])

@@ -160,9 +160,7 @@ def _cloud(depth: Depth, intrinsics: Intrinsics, cube: Cube) -> list[int]:
     return np.rint(1000 * points[::max(1, len(points) // _CLOUD_POINTS)]).astype(int).ravel().tolist()
 
 
-def _millimetres(joints: NDArray[np.floating[Any]], cube: Cube) -> list[list[float] | None] | None:
-    if not np.isfinite(joints).any():
-        return None
+def _millimetres(joints: NDArray[np.floating[Any]], cube: Cube) -> list[list[float] | None]:
     return [np.round(1000 * (joint - cube.center), 1).tolist() if np.isfinite(joint).all() else None
             for joint in joints]
 

@@ -16,8 +16,9 @@ import pytest
 import torch
 from scipy.io import savemat
 
-from hand_pose_ros.bags.writer import BagWriter
+from hand_pose_ros.bags import BagWriter, DepthBag
 from hand_pose_ros.datasets import DatasetError, joints_in_metres, open_dataset
+from hand_pose_ros.datasets import bags as bags_module
 from hand_pose_ros.datasets import icvl as icvl_module
 from hand_pose_ros.datasets import msra as msra_module
 from hand_pose_ros.datasets import nyu as nyu_module
@@ -227,6 +228,7 @@ def test_hands_of_one_image_have_sides_of_their_own_and_must_be_told_in_its_fram
             bag.write_hands(1000, frame, [labelled('right', joints), labelled('left', joints)], HAND21)
     train = open_dataset('bags', 'train', tmp_path)
     assert [train.frame(i).left for i in range(2)] == [False, True]
+    assert train.frame(0).seed == pytest.approx(joints.mean(0))
     with pytest.raises(InputError, match="its joints are in frame 'world', but the images in 'camera'"):
         open_dataset('bags', 'test', tmp_path).frame(0)
 
@@ -262,11 +264,11 @@ def test_bags(tmp_path, caplog):
 
 def test_bags_that_were_corrected_are_not_read_from_the_cache(tmp_path):
     joints = scattered(np.random.default_rng(4), 21, np.array([0.1, 0.0, 0.5]))
-    path = tmp_path / 'train' / 'mine.mcap'
+    path, middle = tmp_path / 'train' / 'mine.mcap', joints.mean(0)
 
-    def recorded(camera: Intrinsics, side: str, seconds: int) -> str:
+    def recorded(camera: Intrinsics, side: str, seconds: int, joints: np.ndarray = joints) -> str:
         with BagWriter(path) as bag:
-            bag.write_depth(1000, 'camera', blob(BAG_CAMERA, joints.mean(0)), camera)
+            bag.write_depth(1000, 'camera', blob(BAG_CAMERA, middle), camera)
             write_hand(bag, 1000, side, joints)
         os.utime(path, (seconds, seconds))
         return open_dataset('bags', 'train', tmp_path).fingerprint
@@ -274,6 +276,7 @@ def test_bags_that_were_corrected_are_not_read_from_the_cache(tmp_path):
     first = recorded(BAG_CAMERA, 'right', 1)
     assert recorded(BAG_CAMERA, 'right', 1) == first
     assert recorded(BAG_CAMERA, 'left', 1) != first
+    assert recorded(BAG_CAMERA, 'right', 1, joints + 0.01) != first
     assert recorded(Intrinsics(310, 310, 160, 120, 320, 240), 'right', 2) != first
 
 
@@ -295,20 +298,42 @@ def test_images_of_a_bag_are_found_in_whatever_order_they_were_recorded(tmp_path
         dataset.frame(3)
 
 
+def test_a_bag_is_read_once_and_stamps_may_be_those_of_another(tmp_path, monkeypatch):
+    rng, opened = np.random.default_rng(4), []
+    monkeypatch.setattr(bags_module, 'DepthBag', lambda path: opened.append(path.stem) or DepthBag(path))
+    for k, name in enumerate('ab'):
+        with BagWriter(tmp_path / 'train' / f'{name}.mcap') as bag:
+            for stamp in range(3):
+                middle = np.array([0.0, 0.0, 0.4 + 0.1 * stamp + 0.05 * k])
+                hand = labelled('right', scattered(rng, 21, middle))
+                bag.write_depth(stamp, 'camera', blob(BAG_CAMERA, middle), BAG_CAMERA)
+                bag.write_hands(stamp, 'camera', [hand, hand], HAND21)
+    dataset = open_dataset('bags', 'train', tmp_path)
+    nearest = [dataset.frame(index).depth[120, 160] for index in (*range(12), 2, 8)]
+    expected = [0.34, 0.34, 0.44, 0.44, 0.54, 0.54, 0.39, 0.39, 0.49, 0.49, 0.59, 0.59, 0.44, 0.49]
+    assert nearest == pytest.approx(expected, abs=1e-3)
+    assert opened == ['a', 'b', 'a', 'b']
+
+
 def test_hands_without_a_joint_are_left_out_and_those_without_a_side_are_told_of(tmp_path, caplog):
     joints = scattered(np.random.default_rng(4), 21, np.array([0.1, 0.0, 0.5]))
     lost, unset = joints.copy(), joints.copy()
     lost[7], unset[:] = np.nan, 0
     with BagWriter(tmp_path / 'train' / 'mine.mcap') as bag:
-        for stamp, (side, each) in enumerate((('right', joints), ('left', lost), ('unknown', joints), ('left', unset))):
+        for stamp, hands in enumerate(([('right', joints)], [('left', lost), ('unknown', joints)], [('left', unset)])):
             bag.write_depth(stamp, 'camera', blob(BAG_CAMERA, joints.mean(0)), BAG_CAMERA)
-            write_hand(bag, stamp, side, each)
+            bag.write_hands(stamp, 'camera', [labelled(*hand) for hand in hands], HAND21)
+    with BagWriter(tmp_path / 'val' / 'mine.mcap') as bag:
+        write_hand(bag, 0, 'left', unset)
     with caplog.at_level(logging.WARNING):
         dataset = open_dataset('bags', 'train', tmp_path)
     assert dataset.size == 2 and dataset.batch(torch.arange(2))['joints'].isfinite().all()
+    assert not any(dataset.frame(index).left for index in range(2))
     left_out, sideless = caplog.messages
     assert 'mine.mcap: 2 of 4 hands' in left_out and 'left out' in left_out
     assert 'mine.mcap: the side of 1 of 2 hands is unknown' in sideless
+    with pytest.raises(DatasetError, match='val must hold hands of one skeleton, not of none'):
+        open_dataset('bags', 'val', tmp_path)
 
 
 # All of them

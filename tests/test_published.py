@@ -292,6 +292,12 @@ def test_results_are_kept_with_all_that_belongs_to_them(tmp_path):
     for name in ('other.npz', 'broken.npz'):
         with pytest.raises(InputError, match=f'{name}: not a result'):
             Result.load(tmp_path / name)
+    arrays = dict(np.load(tmp_path / 'r.npz'))
+    for key, wrong in (('joints', np.zeros((3, 14, 3))), ('truth', np.zeros((4, 21, 3))), ('stamps_ns', np.arange(2)),
+                       ('hand_ids', np.array(['a'])), ('seconds_0', np.zeros(2))):
+        np.savez(tmp_path / 'odd.npz', **{**arrays, key: wrong})
+        with pytest.raises(InputError, match=rf'odd\.npz: the shape of .* is \({len(wrong)},.*, not \(3'):
+            Result.load(tmp_path / 'odd.npz')
     with pytest.raises(InputError, match=r'none\.npz: the file cannot be read'):
         Result.load(tmp_path / 'none.npz')
     whole = (tmp_path / 'r.npz').read_bytes()

@@ -118,7 +118,7 @@ class Result:
         """Read a file of `save`.
 
         Raises:
-            InputError: the file is missing, damaged, or of another kind.
+            InputError: the file is missing, damaged, or of another kind, or its arrays do not fit each other.
         """
         try:
             with np.load(path) as file:
@@ -126,7 +126,7 @@ class Result:
                 if meta['format'] != FORMAT:
                     raise InputError(f"{path}: version {meta['version']} wrote it in another form: evaluate again")
                 name, joint_names, parents = (meta['skeleton'][key] for key in ('name', 'joint_names', 'parents'))
-                return cls(
+                result = cls(
                     name=meta['name'], skeleton=Skeleton(name, tuple(joint_names), tuple(parents)),
                     intrinsics=Intrinsics(**meta['intrinsics']), predictions=file['joints'],
                     truth=file.get('truth'), stamps_ns=file.get('stamps_ns'),
@@ -134,6 +134,15 @@ class Result:
                     parts={name: (start, stop) for name, (start, stop) in meta['parts'].items()},
                     notes=tuple(meta['notes']), info=meta['info'], in_time=meta.get('in_time', True),
                     hand_ids=file.get('hand_ids'))
+            frames = len(result.predictions)
+            points = frames, len(result.skeleton), 3
+            for key, array, shape in (
+                    ('joints', result.predictions, points), ('truth', result.truth, points),
+                    ('stamps_ns', result.stamps_ns, (frames,)), ('hand_ids', result.hand_ids, (frames,)),
+                    *((f'times of {stage}', seconds, (frames,)) for stage, seconds in result.seconds.items())):
+                if array is not None and array.shape != shape:
+                    raise InputError(f'{path}: the shape of {key} is {array.shape}, not {shape}: evaluate again')
+            return result
         except OSError as error:
             raise InputError(f'{path}: the file cannot be read ({error.strerror or error})') from None
         except DAMAGE:

@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import cv2
@@ -72,6 +72,21 @@ def test_a_node_that_cannot_start_is_not_waited_for(tmp_path: Path, ros_domain: 
     write_bag(tmp_path / 'hand.mcap')
     assert main(['demo', '--bag', str(tmp_path / 'hand.mcap'), '--model', 'nope', '--out', str(tmp_path / 'out')]) == 1
     assert "hand-pose demo: the node does not start: there is no checkpoint named 'nope'" in capfd.readouterr().err
+
+
+def test_the_node_ends_with_the_command_that_started_it_also_if_that_is_killed(tmp_path: Path, weights: Path,
+                                                                               ros_domain: int) -> None:
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'hand_pose_ros.cli', 'demo', '--model', str(weights), '--out', str(tmp_path / 'out')],
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    try:
+        while 'listening to' not in (line := process.stderr.readline()):  # says the node
+            assert line
+        process.kill()
+        assert 'Traceback' not in process.communicate(timeout=200)[1]  # which ends when the node no longer holds it
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
 
 
 def ends(code: int) -> list[str]:

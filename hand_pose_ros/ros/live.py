@@ -37,6 +37,15 @@ START_TIMEOUT_S = 60.0
 """Maximum time for the node to start. Loading the network takes most of it."""
 QUIET_S = 2.0
 """If no answer comes for this time after the last one, none will come."""
+_NODE = """\
+import os, signal, sys, threading
+def end():
+    os.read(0, 1)  # nothing ever comes: it returns when the process that started this one has ended
+    os.kill(os.getpid(), signal.SIGTERM)
+threading.Thread(target=end, daemon=True).start()
+from hand_pose_ros.cli import main
+sys.exit(main(['estimator', '--ros-args', *sys.argv[1:]]))
+"""
 
 
 @dataclass(frozen=True)
@@ -170,8 +179,8 @@ def _listening(namespace: str, depth_topic: str, image_type: type) -> Iterator[_
 
 @contextmanager
 def _running(arguments: list[str]) -> Iterator[subprocess.Popen[bytes]]:
-    """Run the node in another process. At the end, stop it as Ctrl-C does."""
-    process = subprocess.Popen([sys.executable, '-m', 'hand_pose_ros.cli', 'estimator', '--ros-args', *arguments])
+    """Run the node in another process. At the end, stop it as Ctrl-C does. If this process is killed, it ends, too."""
+    process = subprocess.Popen([sys.executable, '-c', _NODE, *arguments], stdin=subprocess.PIPE)
     try:
         yield process
     finally:

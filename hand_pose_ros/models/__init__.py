@@ -32,6 +32,8 @@ ARCHITECTURES: dict[str, Callable[..., nn.Module]] = {
 }
 REFINERS = ('std_ref', 'or_ref')
 """The architectures that correct the joints of another network."""
+NO_JOINTS = ('hand_finder', 'center_refiner', *REFINERS)
+"""Those that predict no joints by themselves: they find hands, or refine the results of other networks."""
 
 
 def build(architecture: str, **config: Any) -> nn.Module:

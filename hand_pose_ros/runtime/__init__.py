@@ -12,15 +12,12 @@ import torch
 from torch import nn
 
 from hand_pose_ros.errors import HandPoseError
-from hand_pose_ros.models import REFINERS
+from hand_pose_ros.models import NO_JOINTS
 from hand_pose_ros.runtime.engine import Engine, Pipeline, TorchEngine
 from hand_pose_ros.runtime.lanes import fill_lanes
 from hand_pose_ros.runtime.onnx_engine import OnnxEngine
 
 __all__ = ['Engine', 'check_device', 'cores', 'default_threads', 'make_engine']
-
-NO_JOINTS = ('hand_finder', 'center_refiner', *REFINERS)
-"""Networks that predict no joints by themselves: they find hands, or refine the results of other networks."""
 
 _log = logging.getLogger(__name__)
 _T = TypeVar('_T')

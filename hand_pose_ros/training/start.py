@@ -11,12 +11,11 @@ from torch import Tensor, nn
 from hand_pose_ros.datasets.base import Dataset
 from hand_pose_ros.datasets.shards import DiskShards, MemoryShards
 from hand_pose_ros.errors import TrainingError
-from hand_pose_ros.models import REFINERS, build
+from hand_pose_ros.models import NO_JOINTS, REFINERS, build
 from hand_pose_ros.models.checkpoints import Checkpoint, load_checkpoint
 from hand_pose_ros.models.dense import ADDED, HandDense
 from hand_pose_ros.models.prior import fit_prior
 from hand_pose_ros.models.two_looks import TwoLooks
-from hand_pose_ros.runtime import NO_JOINTS
 from hand_pose_ros.skeleton import Skeleton
 from hand_pose_ros.training.augmentation import PRESETS, augment
 from hand_pose_ros.training.objectives import PoseObjective, RefinerObjective, objective_for, which_count
@@ -112,7 +111,7 @@ def _make_network(recipe: Recipe, base: Checkpoint | None, skeleton: Skeleton) -
     if recipe.network == 'hand_finder' and recipe.augmentation != PRESETS['none']:
         raise TrainingError('hand_finder has its own augmentation: leave out --set augmentation')
     given: dict[str, Any] = {}
-    if recipe.network not in ('center_refiner', 'hand_finder'):
+    if recipe.network not in NO_JOINTS:
         given['joints'] = len(skeleton)
     first = None
     if recipe.network == 'two_looks':

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from hand_pose_ros.cli.train import add_machine_arguments, machine, show_progress
+
 DESCRIPTION = """\
 Repeat an experiment of the paper: train the networks that it needs, test them, and write tables and plots.
 This may take hours. After Ctrl-C, start the same command again to continue."""
@@ -31,8 +33,6 @@ NAMES = ('networks', 'bottleneck', 'refinement', 'joints', 'runtime', 'qualitati
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the verb takes."""
-    from hand_pose_ros.cli.train import add_machine_arguments
-
     parser.add_argument('name', choices=NAMES, metavar='NAME', help='see below')
     parser.add_argument('--out', type=Path, required=True, metavar='OUT', help='folder of results and trained networks')
     parser.add_argument('--recipe', default='paper', help='recipe of all networks (default: %(default)s)')
@@ -43,7 +43,6 @@ def run(args: argparse.Namespace) -> int:
     """Train what is missing, test, write the results and print the table."""
     from tqdm.contrib.logging import logging_redirect_tqdm
 
-    from hand_pose_ros.cli.train import machine, show_progress
     from hand_pose_ros.training.experiments import EXPERIMENTS, Laboratory
     from hand_pose_ros.training.recipes import get_recipe
 

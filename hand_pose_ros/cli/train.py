@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import atexit
+import logging
+import signal
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from hand_pose_ros.cli.arguments import count, none_or_more
 from hand_pose_ros.files import check_writable
+
+if TYPE_CHECKING:
+    from hand_pose_ros.training.loop import Machine
 
 DESCRIPTION = """\
 Train a network from a recipe, on synthetic hands or a recorded dataset. This may take hours. Ctrl-C stops
@@ -52,8 +58,8 @@ def add_machine_arguments(parser: argparse.ArgumentParser) -> None:
                              '%(default)s)')
 
 
-def machine(args: argparse.Namespace) -> Any:
-    """The `training.loop.Machine` that the arguments name."""
+def machine(args: argparse.Namespace) -> Machine:
+    """Where to train, as the arguments say."""
     from hand_pose_ros.training.loop import Machine
 
     return Machine(args.cache, args.device, args.workers, args.threads, args.cache_gb)
@@ -61,10 +67,6 @@ def machine(args: argparse.Namespace) -> Any:
 
 def show_progress() -> None:
     """Print what is logged. A second Ctrl-C, while Python cleans up after the first one, ends the process silently."""
-    import atexit
-    import logging
-    import signal
-
     logging.basicConfig(level=logging.INFO, format='%(message)s')
     atexit.register(signal.signal, signal.SIGINT, signal.SIG_DFL)
 

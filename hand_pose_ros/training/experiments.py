@@ -20,6 +20,7 @@ import torch
 from matplotlib.figure import Figure
 
 from hand_pose_ros.datasets import Batch, joints_in_metres
+from hand_pose_ros.datasets.synthetic import INGREDIENTS
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.evaluation import plots
 from hand_pose_ros.evaluation.benchmark_evaluation import NOMINAL
@@ -28,6 +29,9 @@ from hand_pose_ros.files import write_bytes, write_json
 from hand_pose_ros.models import REFINERS, build
 from hand_pose_ros.models.checkpoints import Checkpoint, load_checkpoint
 from hand_pose_ros.models.prior import fit_prior
+from hand_pose_ros.runtime import make_engine
+from hand_pose_ros.runtime.engine import Pipeline, TorchEngine
+from hand_pose_ros.runtime.timing import measure
 from hand_pose_ros.skeleton import Skeleton, get_skeleton
 from hand_pose_ros.training import figures
 from hand_pose_ros.training.folder import RunFolder
@@ -83,6 +87,7 @@ class Laboratory:
         return load_checkpoint(folder.checkpoint('last'))
 
     def network(self, architecture: str, width: int | None) -> Checkpoint:
+        """The trained network of an architecture, with a bottleneck of this width; None = direct regression."""
         return self.train(label(architecture, width), network=architecture, options=self.options(width))
 
     def options(self, width: int | None) -> dict[str, Any]:
@@ -124,23 +129,23 @@ class Laboratory:
         return _result(name, get_skeleton(checkpoint.metadata['skeleton']), estimates, truths,
                        samples=checkpoint.metadata['samples'], dataset=self.recipe.dataset)
 
-    def chain(self, name: str, checkpoint: Checkpoint, count: int) -> list[Result]:
-        """The results after 1, 2, ... `count` iterations of the refiner."""
+    def chain(self, name: str, checkpoint: Checkpoint) -> list[Result]:
+        """The results after 1, 2, ... ITERATIONS iterations of the refiner."""
         network, refiner = checkpoint.network, checkpoint.refiner
         skeleton = get_skeleton(checkpoint.metadata['skeleton'])
         assert refiner is not None
 
         def predict(patch: torch.Tensor) -> torch.Tensor:
             joints = [network(patch)]
-            for _ in range(count):
+            for _ in range(ITERATIONS):
                 joints.append(refiner(patch, joints[-1], iterations=1))
             return torch.cat(joints[1:], dim=1)
 
-        every = list(range(len(skeleton))) * count
-        estimates, truths = (part.unflatten(1, (count, len(skeleton)))
+        every = list(range(len(skeleton))) * ITERATIONS
+        estimates, truths = (part.unflatten(1, (ITERATIONS, len(skeleton)))
                              for part in estimate(predict, self.test, torch.device('cpu'), every))
         return [_result(f'{name} x{i + 1}', skeleton, estimates[:, i], truths[:, i],
-                        samples=checkpoint.metadata['samples'], dataset=self.recipe.dataset) for i in range(count)]
+                        samples=checkpoint.metadata['samples'], dataset=self.recipe.dataset) for i in range(ITERATIONS)]
 
     def truth_through(self, width: int, skeleton: Skeleton) -> Result:
         """The true poses of the test samples, projected onto their principal components.
@@ -214,7 +219,7 @@ def refinement(lab: Laboratory) -> str:
     lab.check_refiner()
     results = [lab.result('deep-30', lab.network('deep', 30))]
     for refiner in REFINERS:
-        results += lab.chain(f'deep-30 + {refiner}', lab.refined(refiner), ITERATIONS)
+        results += lab.chain(f'deep-30 + {refiner}', lab.refined(refiner))
     twice = [results[0], *(result for result in results if result.name.endswith('x2'))]
     lab.write_results('refinement-curves', twice, plots.curves(twice))
     return lab.write_results('refinement', results, figures.iterations(results))
@@ -239,10 +244,6 @@ def qualitative(lab: Laboratory) -> str:
 
 def runtime(lab: Laboratory) -> str:
     """Milliseconds for one hand, on this machine and in the paper. Weights are random, which takes the same time."""
-    from hand_pose_ros.runtime import make_engine
-    from hand_pose_ros.runtime.engine import Pipeline, TorchEngine
-    from hand_pose_ros.runtime.timing import measure
-
     patch = lab.test[0]['patch'][:1].float().numpy()
     calls: dict[str, Callable[[], Any]] = {}
     for name in PAPER_MS:
@@ -263,7 +264,6 @@ def runtime(lab: Laboratory) -> str:
 
 def ingredients(lab: Laboratory) -> str:
     """Deep-Prior, trained on synthetic hands that lack one or all ingredients, and tested on complete ones."""
-    from hand_pose_ros.datasets.synthetic import INGREDIENTS
     if lab.recipe.dataset != 'synthetic':
         raise HandPoseError(f'--set dataset={lab.recipe.dataset}: only synthetic hands have ingredients to leave out')
     results = [lab.result('complete', lab.network('deep', 30))]

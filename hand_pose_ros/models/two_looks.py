@@ -91,7 +91,7 @@ class TwoLooks(nn.Module):
         super().__init__()
         if not all(0 <= joint < joints for joint in (root, *knuckles)) or not knuckles:
             raise HandPoseError(f'root {root} and knuckles {list(knuckles)} are not all among {joints} joints')
-        self.joints, self.root, self.knuckles = joints, root, list(knuckles)
+        self.root, self.knuckles = root, list(knuckles)
         second: dict[str, Any] = {'width': width, 'bottleneck': bottleneck, 'blocks': blocks, 'refined': refined}
         self.first = HandDense(joints, **(first or second))
         self.first.requires_grad_(False).eval()

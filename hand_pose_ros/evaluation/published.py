@@ -104,8 +104,8 @@ def read_text(path: str | Path, skeleton: Skeleton) -> Labels:
         if len(fields) != 3 * len(skeleton):
             raise InputError(
                 f'{path}: line {number} has {len(fields)} numbers, but the {len(skeleton)} joints of '
-                f'{skeleton.name} have u v d each, {3 * len(skeleton)} together: choose another --dataset, '
-                'or mend the line')
+                f'{skeleton.name} have u v d each, {3 * len(skeleton)} together, with blanks between them: choose '
+                'another --dataset, or mend the line')
         try:
             rows.append(np.array(fields, np.float64))
         except ValueError:

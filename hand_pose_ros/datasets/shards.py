@@ -150,7 +150,7 @@ class DiskShards:
         pool.shutdown(wait=True, cancel_futures=True)
         for worker in workers:
             for path in self._folder.glob(f'.*.{worker.pid}.part'):
-                path.unlink()
+                path.unlink(missing_ok=True)
 
 
 def read_shard(path: Path, check: bool = True) -> Batch:

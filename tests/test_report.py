@@ -37,7 +37,7 @@ def flat_hand(rng):
 def result():
     rng = np.random.default_rng(0)
     truth = np.stack([flat_hand(rng) for _ in range(40)])
-    predictions = truth + rng.normal(0, 0.004, truth.shape) * np.linspace(0.1, 3, 40)[:, None, None]
+    predictions = truth + rng.normal(0, 0.004, truth.shape) * np.linspace(0.1, 5, 40)[:, None, None]
     predictions[7] = np.nan
     return Result('ours <&> others', HAND21, CAMERA, predictions, truth, 33_000_000 * np.arange(40),
                   {'predict': rng.uniform(0.001, 0.002, 40), 'total': rng.uniform(0.003, 0.004, 40)},

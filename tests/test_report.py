@@ -121,6 +121,7 @@ def test_notes_of_all_results_are_told(result, tmp_path):
     one, other = (replace(result, name=name, notes=(f'what to know of {name}',)) for name in ('one', 'other'))
     html = write_report([replace(one, info={'dataset': 'nyu'}), other], tmp_path).read_text()
     assert all(f'<td>{name}</td><td>{mean:g}</td>' in html for name, mean in DATASETS['nyu'].published)
+    assert html.count('<td>other</td>') == 2, 'in the tables of accuracy and of fingers'
     assert write_report([one, replace(other, truth=None)], tmp_path).read_text().count('<td>other</td>') == 0
     assert 'one: what to know of one' in html and 'other: what to know of other' in html
 

@@ -11,8 +11,10 @@ from hand_pose_ros.cli import main
 from hand_pose_ros.datasets import joints_in_metres, open_dataset
 from hand_pose_ros.evaluation import benchmark_evaluation
 from hand_pose_ros.evaluation.benchmark_evaluation import _self_knowledge, evaluate_benchmark
+from hand_pose_ros.evaluation.dataset_evaluation import evaluate_dataset
 from hand_pose_ros.models import build
 from hand_pose_ros.models.checkpoints import load_checkpoint, save_checkpoint
+from hand_pose_ros.runtime.engine import Pipeline, TorchEngine
 from hand_pose_ros.synthetic import benchmark
 from hand_pose_ros.synthetic.generator import LEFT
 
@@ -58,7 +60,8 @@ def test_errors_are_those_of_the_scene_also_of_left_hands(tmp_path):
 
 def test_joints_are_told_apart_by_what_the_camera_sees(tmp_path, monkeypatch):
     weights = tmp_path / 'net.safetensors'
-    save_checkpoint(weights, build('hand_dense', width=4), {'skeleton': 'hand21', 'cube_side': 0.3})
+    save_checkpoint(weights, build('hand_dense', width=4), {'skeleton': 'hand21', 'cube_side': 0.3},
+                    build('or_ref'))
     scene = next(iter(benchmark.frames(50, batch=50)))
 
     class Knowing:
@@ -72,18 +75,23 @@ def test_joints_are_told_apart_by_what_the_camera_sees(tmp_path, monkeypatch):
             joints = scene['joints'].clone()
             joints[..., 2] += ~scene['visible'] * 0.060 / scene['cube_side'][:, None]
             return {'joints': joints.numpy(), 'confidence': np.zeros((50, 21)), 'hand': np.zeros(50),
-                    'side': np.full(50, not mirrored, float)}
+                    'side': np.full(50, -1.0 - mirrored)}
 
-    monkeypatch.setattr(benchmark_evaluation, 'make_engine', lambda *_, **__: Knowing())
+    asked = {}
+    monkeypatch.setattr(benchmark_evaluation, 'make_engine', lambda _, **options: asked.update(options) or Knowing())
     info = evaluate_benchmark(str(weights), device='cpu', frames=50).info
+    assert asked['device'] == 'cpu' and asked['refiner'] is not None
     assert info['visible_joints']['mean_mm'] < 0.01 and info['hidden_joints']['median_mm'] == pytest.approx(30, rel=0.1)
     [row] = info['calibration_20_mm']
     assert row['right'] == pytest.approx(info['visible_joints']['joints'] / row['joints'], abs=1e-3)
     assert info['side_found'] == 1
+    for row in info['frames_by_visible_joints']:
+        most, least = (30 * (21 - visible) / 21 for visible in row['visible'])
+        assert 0.9 * least <= row['mean_mm'] <= 1.1 * most
 
 
 def test_calibration_counts_what_was_right():
-    confidence = np.array([[4.0, -4.0], [4.0, 4.0], [9.0, 9.0]], np.float32)
+    confidence = np.array([[4.0, -4.0], [4.0, 99.0], [9.0, 9.0]], np.float32)
     right = np.array([[True, False], [True, False], [True, True]])
     known = _self_knowledge(confidence, right, np.array([3.0, -1.0, 2.0], np.float32), np.array([True, False, True]),
                             np.array([True, True, False]))
@@ -110,8 +118,8 @@ def test_weights_for_other_joints_are_refused(tmp_path, capsys):
 
 def test_a_network_is_scored_on_the_test_frames_of_its_dataset(folder, tmp_path, capsys):
     weights, json_file = tmp_path / 'own.safetensors', tmp_path / 'result.json'
-    network = build('shallow', joints=16).eval()
-    save_checkpoint(weights, network, {'skeleton': 'icvl16', 'cube_side': 0.25})
+    save_checkpoint(weights, build('shallow', joints=16), {'skeleton': 'icvl16', 'cube_side': 0.25},
+                    build('or_ref', joints=16))
     arguments = ['evaluate', 'icvl', '--root', str(folder), '--device', 'cpu']
     for split, frames in ((['--split', 'test_1'], 3), ([], 6)):
         assert main([*arguments, *split, '--model', str(weights), '--json', str(json_file)]) == 0
@@ -119,10 +127,14 @@ def test_a_network_is_scored_on_the_test_frames_of_its_dataset(folder, tmp_path,
         assert summary['frames'] == frames
     batch = open_dataset('icvl', 'test', folder).batch(torch.arange(6))
     cube = batch['cube_center'], batch['cube_side']
-    with torch.no_grad():
-        joints = load_checkpoint(weights).network(batch['patch'])
-    apart = joints_in_metres(joints, *cube) - joints_in_metres(batch['joints'], *cube)
-    assert summary['mean_mm'] == pytest.approx(1000 * float(apart.norm(dim=-1).mean()), abs=0.01)
+    checkpoint = load_checkpoint(weights)
+    joints = torch.from_numpy(TorchEngine(Pipeline(checkpoint.network, checkpoint.refiner)).run(batch['patch'].numpy()))
+    predictions, truth = joints_in_metres(joints, *cube), joints_in_metres(batch['joints'], *cube)
+    assert summary['mean_mm'] == pytest.approx(1000 * float((predictions - truth).norm(dim=-1).mean()), abs=0.01)
+    assert summary['error_jitter_mm'] is summary['bone_drift_mm'] is None, 'no frame follows another'
+    result = evaluate_dataset('icvl', folder, str(weights), device='cpu')
+    np.testing.assert_allclose(result.predictions, predictions, atol=1e-5)
+    np.testing.assert_allclose(result.truth, truth, atol=1e-6)
 
     assert main([*arguments, '--model', 'hand_dense']) == 1
     assert 'its joints are those of hand21, but icvl has those of icvl16' in capsys.readouterr().err

@@ -85,10 +85,10 @@ def test_listing_the_verbs_loads_no_heavy_library():
 @pytest.mark.skipif(sys.platform != 'linux', reason='elsewhere there is always a display')
 @pytest.mark.parametrize(('option', 'wanted'), [
     ('--max-hands', 'a whole number'), ('--depth-scale', 'a number'), ('--cube-size', 'a number'),
-    ('--min-score', 'a number')])
+    ('--min-score', 'a number'), ('--intrinsics', 'a number')])
 def test_text_where_a_number_belongs_is_told_in_plain_words(option, wanted, capsys):
     with pytest.raises(SystemExit) as exit_:
-        main(['estimate', 'x', option, 'many'])
+        main(['estimate', 'x', option, *['many'] * (4 if option == '--intrinsics' else 1)])
     assert exit_.value.code == 2
     assert f'argument {option}: many is not {wanted} (' in capsys.readouterr().err
 

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from hand_pose_ros.estimator import HandPoseEstimator
 
 
-def _number(text: str, fits: Callable[[float], bool], why: str) -> float:
+def number(text: str, fits: Callable[[float], bool] = lambda _: True, why: str = '') -> float:
+    """A number that fits. If it does not, `why` says what it is not."""
     try:
         value = float(text)
     except ValueError:  # of it, argparse would name the function
@@ -44,17 +45,17 @@ def none_or_more(text: str) -> int:
 
 def share(text: str) -> float:
     """0 to 1."""
-    return _number(text, lambda value: 0 <= value <= 1, 'not between 0 and 1')
+    return number(text, lambda value: 0 <= value <= 1, 'not between 0 and 1')
 
 
 def metres(text: str) -> float:
     """More than 0 and at most 1, as the unit of depth is."""
-    return _number(text, lambda value: 0 < value <= 1, 'not more than 0 and at most 1 (metres)')
+    return number(text, lambda value: 0 < value <= 1, 'not more than 0 and at most 1 (metres)')
 
 
 def cube(text: str) -> float:
     """0.05 to 1 m, as the node takes it."""
-    return _number(text, lambda value: 0.05 <= value <= 1, 'not between 0.05 and 1 (metres)')
+    return number(text, lambda value: 0.05 <= value <= 1, 'not between 0.05 and 1 (metres)')
 
 
 def keep_input(output: str | Path | None, source: str | Path | None) -> None:
@@ -92,7 +93,7 @@ def add_bag(parser: Any) -> None:
                         help='topic of the depth images; needed if several topics carry depth')
     parser.add_argument('--camera-info-topic', metavar='TOPIC',
                         help='if it is not the camera_info beside the depth topic')
-    parser.add_argument('--intrinsics', nargs=4, type=float, metavar=('FX', 'FY', 'CX', 'CY'),
+    parser.add_argument('--intrinsics', nargs=4, type=number, metavar=('FX', 'FY', 'CX', 'CY'),
                         help='of the camera, in pixels; they replace those of camera_info')
     parser.add_argument('--depth-scale', type=metres, default=0.001, metavar='M',
                         help='metres per unit of 16-bit depth (0.001)')

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from hand_pose_ros.cli.arguments import number
+
 DESCRIPTION = 'Publish a bag (ROS 1, sqlite3, MCAP) on ROS 2 topics, with its recorded types and stamps.'
 
 EXAMPLES = """examples:
@@ -25,15 +27,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the verb takes."""
     parser.add_argument('bag', metavar='BAG', type=Path, help='a .bag, .mcap or .db3 file, or a ROS 2 folder')
     parser.add_argument('--topics', nargs='+', metavar='TOPIC', help='publish only these')
-    parser.add_argument('--rate', type=float, default=1.0, metavar='X', help='play X times as fast as recorded (1)')
+    parser.add_argument('--rate', type=number, default=1.0, metavar='X', help='play X times as fast as recorded (1)')
     parser.add_argument('--loop', action='store_true', help='start again at the end, until Ctrl-C')
-    parser.add_argument('--start', type=float, default=0.0, metavar='S', help='begin S seconds into the bag (0)')
+    parser.add_argument('--start', type=number, default=0.0, metavar='S', help='begin S seconds into the bag (0)')
     parser.add_argument('--start-paused', action='store_true',
                         help='start paused, until the service /replay/pause is called')
     parser.add_argument('--clock', action='store_true', help='publish /clock, for nodes with use_sim_time')
     parser.add_argument('--qos', default='recorded', choices=('recorded', 'reliable', 'best_effort'),
                         help='reliability of the publishers (recorded; ROS 1 bags: reliable)')
-    parser.add_argument('--wait', type=float, default=4.0, metavar='S',
+    parser.add_argument('--wait', type=number, default=4.0, metavar='S',
                         help='seconds to wait before the first message, so that subscribers find the topics; they may '
                              'need 3 (4)')
     parser.add_argument('--ros-args', nargs=argparse.REMAINDER, default=[], metavar='...',

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hand_pose_ros.errors import InputError
+from hand_pose_ros.errors import InputError, counted
 from hand_pose_ros.evaluation.results import Result, split_source
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.skeleton import Skeleton, get_skeleton
@@ -103,7 +103,7 @@ def read_text(path: str | Path, skeleton: Skeleton) -> Labels:
             names.append(fields.pop(0))
         if len(fields) != 3 * len(skeleton):
             raise InputError(
-                f'{path}: line {number} has {len(fields)} numbers, but the {len(skeleton)} joints of '
+                f'{path}: line {number} has {counted(len(fields), "numbers")}, but the {len(skeleton)} joints of '
                 f'{skeleton.name} have u v d each, {3 * len(skeleton)} together, with blanks between them: choose '
                 'another --dataset, or mend the line')
         try:

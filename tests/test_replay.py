@@ -183,7 +183,7 @@ def test_start_rate_and_topics(bag, listener, play):
     assert listener.until(lambda: len(listener.heard['/depth/image_rect']) == 4)
     assert stamps(listener.heard['/depth/image_rect']) == STAMPS[8:]
     assert not listener.heard['/depth/camera_info']
-    with pytest.raises(InputError, match=r'nothing was recorded later than 99 s'):
+    with pytest.raises(InputError, match=r'nothing was recorded later than 99 s: give a smaller --start'):
         replay.play(start_s=99)
 
 

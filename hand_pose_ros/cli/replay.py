@@ -70,5 +70,6 @@ def run(args: argparse.Namespace) -> int:
         finally:
             for topic, count in sorted((replay.name(topic), count) for topic, count in replay.published.items()):
                 print(f'{count:7d}  {topic}')
-            print(f'no message was published more than {1000 * replay.lateness_s:.0f} ms after its time')
+            if any(replay.published.values()):
+                print(f'no message was published more than {1000 * replay.lateness_s:.0f} ms after its time')
     return code

@@ -115,7 +115,7 @@ class Replay:
         messages = self._bag.messages(self._connections, start=start_ns)
         first = next(messages, None)
         if first is None:
-            raise InputError(f'{self._bag.path}: nothing was recorded later than {start_s} s: give a smaller start')
+            raise InputError(f'{self._bag.path}: nothing was recorded later than {start_s} s: give a smaller --start')
         first_ns, self._origin = first[1], time.monotonic()
         for connection, recorded_ns, data in chain(latched, [first], messages):
             message = self._to_ros2(connection, data)

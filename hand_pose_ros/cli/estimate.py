@@ -80,15 +80,15 @@ def run(args: argparse.Namespace) -> int:
     with ExitStack() as stack:
         images, number = _open(args, stack)
         estimator = make_estimator(args)
-        sinks: list[Sink] = []
+        outputs: list[Output] = []
         if args.overlay:
-            sinks.append(_overlays(args.overlay, estimator.skeleton))
+            outputs.append(_overlays(args.overlay, estimator.skeleton))
         if args.out and args.out.suffix == '.npz':
-            sinks.append(stack.enter_context(_arrays(args.out, estimator.skeleton)))
+            outputs.append(stack.enter_context(_arrays(args.out, estimator.skeleton)))
         elif args.out:
             bag = stack.enter_context(HandBag(args.out, estimator.skeleton, estimator.metadata))
-            sinks.append(lambda image, _depth, _intrinsics, hands: bag.add(image, hands))
-        failed = estimate(images, number, estimator, sinks, stack)
+            outputs.append(lambda image, _depth, _intrinsics, hands: bag.add(image, hands))
+        failed = estimate(images, number, estimator, outputs, stack)
     print('wrote', ' and '.join(str(path) for path in (args.out, args.overlay) if path))
     return failed
 
@@ -104,13 +104,13 @@ class DepthInput:
     load: Callable[[], tuple[NDArray[np.float32], Intrinsics]]
 
 
-Sink = Callable[[DepthInput, NDArray[np.float32], Intrinsics, Sequence[HandEstimate]], None]
+Output = Callable[[DepthInput, NDArray[np.float32], Intrinsics, Sequence[HandEstimate]], None]
 """Takes an image with its depth (H, W) in metres, its intrinsics and its hands, and writes them in one way."""
 
 
-def estimate(images: Iterator[DepthInput], number: int, estimator: HandPoseEstimator, sinks: Sequence[Sink],
+def estimate(images: Iterator[DepthInput], number: int, estimator: HandPoseEstimator, outputs: Sequence[Output],
              files: ExitStack) -> int:
-    """Run the estimator over all images and pass the results to the sinks. Returns 1 if any image could not be used.
+    """Run the estimator over all images and pass the results to the outputs. Returns 1 if any image could not be used.
 
     Such images are reported and left out.
 
@@ -138,8 +138,8 @@ def estimate(images: Iterator[DepthInput], number: int, estimator: HandPoseEstim
             continue
         found += bool(hands)
         problem = problem or ('' if hands else depth_problem(depth, estimator.near, estimator.far))
-        for sink in sinks:
-            sink(image, depth, intrinsics, hands)
+        for output in outputs:
+            output(image, depth, intrinsics, hands)
     done = len(seconds)
     if not done:
         raise InputError(f'none of the images ({failed}) could be used, so nothing was written')
@@ -204,7 +204,7 @@ def _natural(path: Path) -> list[Any]:
     return [int(part) if part.isdecimal() else part for part in re.split(r'(\d+)', path.name)]
 
 
-def _overlays(folder: Path, skeleton: Skeleton) -> Sink:
+def _overlays(folder: Path, skeleton: Skeleton) -> Output:
     """Draws a picture of each image."""
     folder.mkdir(parents=True, exist_ok=True)
     if any(folder.glob('*.png')):
@@ -218,7 +218,7 @@ def _overlays(folder: Path, skeleton: Skeleton) -> Sink:
 
 
 @contextmanager
-def _arrays(path: Path, skeleton: Skeleton) -> Iterator[Sink]:
+def _arrays(path: Path, skeleton: Skeleton) -> Iterator[Output]:
     """Keeps all hands, and writes one .npz in the end. After an error, nothing is written."""
     check_writable(path)
     images: list[DepthInput] = []

@@ -19,6 +19,9 @@ from torch import Tensor, nn
 from hand_pose_ros.geometry import PATCH_SIZE
 from hand_pose_ros.models.prior_net import relu_conv
 
+FAR = 100.0
+"""Depth of the background in cube units. It is behind the back face of every cube, wherever a joint is."""
+
 
 class Layer(NamedTuple):
     """A convolution without padding, max-pooling, and ReLU, as everywhere in the paper."""
@@ -134,10 +137,6 @@ def _branch(joints: int, layers: tuple[Layer, ...]) -> list[nn.Module]:
         modules.append(nn.ReLU())
         inputs = layer.filters
     return modules
-
-
-FAR = 100.0
-"""Depth of the background in cube units. It is behind the back face of every cube, wherever a joint is."""
 
 
 def _reach(region: Region) -> float:

@@ -219,6 +219,15 @@ def test_a_bad_file_is_reported_and_the_rest_goes_on(tmp_path, folder, command, 
     assert 'nothing had a score' not in said.err and 'of the depth is' not in said.err, 'there are hands'
 
 
+@pytest.mark.skipif(not os.path.exists('/dev/full'), reason='only Linux has /dev/full')
+@pytest.mark.parametrize('name', ['joints.npz', 'joints.mcap'])
+def test_a_summary_that_cannot_be_printed_loses_no_joints(name, tmp_path, folder, command, monkeypatch):
+    with open('/dev/full', 'w', buffering=1) as full:  # each line at once, as with PYTHONUNBUFFERED
+        monkeypatch.setattr(sys, 'stdout', full)
+        assert command(folder / '8.png', *INTRINSICS, '--out', tmp_path / name) == 1
+    assert (tmp_path / name).stat().st_size
+
+
 def test_what_comes_before_the_damage_of_a_bag_counts(tmp_path, bag, command, capsys):
     with BagWriter(tmp_path / 'long.mcap') as writer:
         noise = np.random.default_rng(0).integers(500, 4000, (120, 160), np.uint16) * np.float32(0.001)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
+from hand_pose_ros.bags import DepthBag
 from hand_pose_ros.cli.arguments import (
     ESTIMATOR,
     add_bag,
@@ -26,11 +27,14 @@ from hand_pose_ros.cli.arguments import (
     keep_input,
     refuse,
 )
+from hand_pose_ros.cli.hand_bag import HandBag
 from hand_pose_ros.errors import HandPoseError, InputError, counted
 from hand_pose_ros.evaluation import published
+from hand_pose_ros.evaluation.ground_truth import read_truth, with_truth
 from hand_pose_ros.evaluation.results import Result, named_apart, split_source, told_notes
 from hand_pose_ros.evaluation.tables import ACCURACY_COLUMNS, accuracy_rows, number, text_table
 from hand_pose_ros.files import write_json
+from hand_pose_ros.skeleton import get_skeleton
 
 if TYPE_CHECKING:
     from hand_pose_ros.evaluation.bag_evaluation import Settings
@@ -154,7 +158,6 @@ def _run_dataset(args: argparse.Namespace, name: str, recorded: bool) -> int:
 
 
 def _run_bag(args: argparse.Namespace) -> int:
-    from hand_pose_ros.cli.hand_bag import HandBag
     from hand_pose_ros.evaluation.bag_evaluation import evaluate_bag, read_depths
 
     keep_input(args.out_bag, args.bags[0])
@@ -172,12 +175,9 @@ def _evaluate_live(args: argparse.Namespace, settings: Settings) -> Result:
     """The answers of the live node to a bag. Images without an answer count as images without a hand."""
     if args.out_bag:
         args.parser.error('--out-bag does not work with --via-ros: record /hand/joints instead')
-    from hand_pose_ros.bags import DepthBag
     from hand_pose_ros.evaluation.bag_evaluation import until_damaged
-    from hand_pose_ros.evaluation.ground_truth import read_truth, with_truth
     from hand_pose_ros.models.checkpoints import DEFAULT, load_checkpoint
     from hand_pose_ros.ros.live import play_through_node
-    from hand_pose_ros.skeleton import get_skeleton
 
     parameters = {'model': args.model, 'device': args.device, 'side': args.side, 'detector': args.detector,
                   'cube_size': args.cube_size, 'min_score': args.min_score, 'depth_scale': args.depth_scale,
@@ -222,7 +222,6 @@ def _evaluate_live(args: argparse.Namespace, settings: Settings) -> Result:
 
 
 def _run_bags(args: argparse.Namespace) -> int:
-    from hand_pose_ros.cli.hand_bag import HandBag
     from hand_pose_ros.evaluation.bag_evaluation import evaluate_bags, read_depths
 
     if args.compare or args.via_ros:

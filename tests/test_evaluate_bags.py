@@ -203,6 +203,18 @@ def test_hands_go_into_a_bag_that_plays_beside_the_original(tmp_path, bag, model
     assert topics == {'/hand/joints', '/hand/skeleton', '/hand/markers'}
 
 
+def test_hands_of_other_joints_replace_what_is_left_of_a_bag(tmp_path, bag):
+    icvl16 = get_skeleton('icvl16')
+    hand = HandEstimate(np.full((16, 3), 0.5, np.float32), icvl16.joint_names, np.ones(16, np.float32), 1.0, 'right',
+                        Cube((0, 0, 0.5), 0.3), 'a')
+    path = tmp_path / 'hands.mcap'
+    path.write_bytes(bag.read_bytes()[:20])
+    with DepthBag(bag) as images, HandBag(path, icvl16, {'architecture': 'a', 'version': '1'}) as hands:
+        hands.add(next(iter(images)), [hand])
+    [recorded] = read_hands(path)
+    assert recorded.skeleton == 'icvl16' and recorded.joints.shape == (1, 16, 3)
+
+
 def test_images_that_cannot_be_decoded_count_as_images_without_a_hand(tmp_path, settings):
     path = tmp_path / 'bag.mcap'
     with BagWriter(path) as bag:

@@ -401,12 +401,15 @@ def test_the_live_node_answers_what_the_estimator_says(ros_domain, tmp_path, mod
     pytest.importorskip('rclpy', reason='ROS is not installed')
     bag = record(tmp_path / 'slow.mcap', frames=8, step_ns=200_000_000)
     model = str(shutil.copy(model, tmp_path / "a: b's #1, [x] {y}.safetensors"))  # as YAML many things, but not a name
-    assert main(arguments(bag, model, '--via-ros', '--json', tmp_path / 'r.json', '--out', tmp_path / 'r.npz')) == 0
+    given = 250.0, 245.0, 150.0, 125.0  # instead of the camera_info
+    assert main(arguments(bag, model, '--via-ros', '--json', tmp_path / 'r.json', '--out', tmp_path / 'r.npz',
+                          '--intrinsics', *given)) == 0
     got, live = json.loads((tmp_path / 'r.json').read_text()), Result.load(tmp_path / 'r.npz').predictions
     answered = np.isfinite(live).all((1, 2))
     assert answered.sum() == 8 - got['dropped'] > 4, 'a busy machine may drop an image'
     until = int(np.argmin(answered)) if got['dropped'] else 8
-    assert live[:until] == pytest.approx(evaluate_bag(bag, settings).predictions[:until], abs=1e-5)
+    expected = evaluate_bag(bag, replace(settings, bag={'intrinsics': given})).predictions
+    assert live[:until] == pytest.approx(expected[:until], abs=1e-5)
     assert 0 < got['latency_ms']['image to joints']['p50'] < 2000
 
 
@@ -414,7 +417,9 @@ def test_the_live_node_is_shown_a_damaged_bag_as_far_as_it_goes(ros_domain, tmp_
     pytest.importorskip('rclpy', reason='ROS is not installed')
     whole = record(tmp_path / 'bag.mcap', step_ns=200_000_000).read_bytes()
     (tmp_path / 'cut.mcap').write_bytes(whole[:int(len(whole) * 0.6)])
-    assert main(arguments(tmp_path / 'cut.mcap', model, '--via-ros', '--json', tmp_path / 'r.json')) == 1
+    # With intrinsics it needs no camera_info.
+    assert main(arguments(tmp_path / 'cut.mcap', model, '--via-ros', '--json', tmp_path / 'r.json', '--intrinsics',
+                          240, 240, 159.5, 119.5, '--camera-info-topic', '/none')) == 1
     got = json.loads((tmp_path / 'r.json').read_text())
     assert got['damaged'] and got['dropped'] < got['frames_total'] < FRAMES
     assert 'before the damage' in capsys.readouterr().err

@@ -356,6 +356,9 @@ def test_another_recording_is_not_replaced(bag, tmp_path, command, capsys):
     assert 'other.mcap: this is a recording of /' in capsys.readouterr().err
     assert other.read_bytes() == bag.read_bytes()
     assert [command(bag, '--out', tmp_path / 'hands.mcap') for _ in range(2)] == [0, 0]
+    os.mkfifo(tmp_path / 'fifo.mcap')  # nobody writes to it: who reads it waits for ever
+    assert command(bag, '--out', tmp_path / 'fifo.mcap') == 1
+    assert 'fifo.mcap: there is something already' in capsys.readouterr().err
 
 
 def test_topics_are_for_bags(folder, command, capsys):

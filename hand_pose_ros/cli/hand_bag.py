@@ -66,7 +66,7 @@ class HandBag:
 def _keep_recording(path: Path) -> None:
     """Raise InputError if there is a bag with topics that a HandBag does not write. They would be lost."""
     topics: set[str] = set()
-    if path.is_file():
+    if path.is_file():  # reading a FIFO may take for ever
         with suppress(InputError), Bag(path) as bag:
             topics = {connection.topic for connection in bag.connections} - set(TOPICS)
     if topics:

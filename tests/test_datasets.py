@@ -400,10 +400,11 @@ def test_synthetic_hands_are_right_hands_to_the_network():
     ('nyuu', 'train', "unknown dataset 'nyuu'"), ('nyu', 'train', r'joint_data\.mat is missing'),
     ('msra', 'train', 'P2 with its gestures is missing'), ('bags', 'train', 'holds no bags'),
     ('synthetic', 'tset', "unknown split 'tset'"), ('synthetic:without-skin', 'train', 'synthetic:without-NAME'),
-    ('icvl', 'tset', "unknown split 'tset'")])
+    ('icvl', 'train', 'give the folder of the dataset'), ('icvl', 'tset', "unknown split 'tset'")])
 def test_what_is_not_there_is_one_sentence(tmp_path, name, split, message):
-    with pytest.raises(DatasetError, match=message):
+    with pytest.raises(DatasetError, match=message) as raised:
         open_dataset(name, split, tmp_path)
+    assert '--' not in str(raised.value), 'the verbs have different options for the folder'
 
 
 def test_shards_are_the_same_wherever_they_are_made_and_mended_when_damaged(tmp_path):

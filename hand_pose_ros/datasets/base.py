@@ -162,7 +162,7 @@ def require(dataset: str, paths: Iterable[Path]) -> bytes:
             states.append(f'{path.name}{state.st_size}-{state.st_mtime_ns}')
     if missing:
         others = f' (and {len(missing) - 1} more files)' if len(missing) > 1 else ''
-        raise DatasetError(f'{dataset}: {missing[0]} is missing{others}; is the download complete, and is --set root= '
+        raise DatasetError(f'{dataset}: {missing[0]} is missing{others}; is the download complete, and is the root '
                            'the folder described in docs/training.md?')
     return ''.join(states).encode()
 

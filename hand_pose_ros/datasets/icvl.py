@@ -81,7 +81,7 @@ def _find(root: Path, part: str, names: list[str]) -> Path:
             if (folder / name).is_file():
                 return folder / name
     raise DatasetError(f'ICVL: neither {root} nor {root / part} holds {" or ".join(names)}; '
-                       'give the folder of the dataset with --set root=FOLDER')
+                       'give the folder of the dataset as its root')
 
 
 def _sequence(path: str) -> str:

@@ -61,7 +61,7 @@ class MSRA(RecordedDataset):
             gestures = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
             if not gestures:
                 raise DatasetError(f'MSRA: {folder} with its gestures is missing; give the folder that holds P0 to P8 '
-                                   'with --set root=FOLDER')
+                                   'as root')
             for gesture in gestures:
                 self._frames += [(subject, *frame) for frame in _read_gesture(gesture)]
         whole = are_labelled(np.array([joints for _, _, joints in self._frames]))

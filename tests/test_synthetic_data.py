@@ -566,6 +566,8 @@ def test_command_line_shows_writes_and_measures(tmp_path, capsys, shared_data):
     assert f'(quartiles)  real {long.name}  ' in head
     assert all(row.count(')  ') == 1 for row in rows), 'columns stand apart'
 
+    assert main(['synth', 'stats', *real[:2], *['many'] * 5]) == 1
+    assert 'many: after the folder come five numbers, FX FY CX CY SCALE' in capsys.readouterr().err
     assert main(['synth', 'show', str(sheet), '--sensors', 'kinect9']) == 1
     assert "unknown sensor 'kinect9'" in capsys.readouterr().err
     assert main(['synth', 'show', str(tmp_path / 'sheet.jpeg2')]) == 1

@@ -103,8 +103,9 @@ def _real(args: argparse.Namespace) -> Iterator[tuple[str, list[tuple[NDArray[np
     for folder, *numbers in args.real:
         try:
             *intrinsics, scale = map(float, numbers)
-        except ValueError as error:
-            raise HandPoseError(f'--real {folder}: {error}; after the folder come FX FY CX CY SCALE') from error
+        except ValueError:
+            raise HandPoseError(f'--real {folder} {" ".join(numbers)}: after the folder come five numbers, '
+                                'FX FY CX CY SCALE') from None
         yield Path(folder).name, real_patches(Path(folder), intrinsics, scale)
 
 

@@ -35,6 +35,9 @@ class _Glb:
     def __init__(self, path: Path) -> None:
         try:
             data = path.read_bytes()
+        except OSError as error:
+            raise InputError(f'{path}: the file cannot be read ({error.strerror}): check the path') from None
+        try:
             magic, version, _, size, kind = struct.unpack_from('<4sIII4s', data)
             if magic != b'glTF' or version != 2 or kind != b'JSON':
                 raise ValueError('it is not a binary glTF 2.0 file')
@@ -42,7 +45,7 @@ class _Glb:
             self._blob = data[28 + size:]
             if not self.json.get('skins'):
                 raise ValueError('it has no skin (bones with weights)')
-        except (OSError, ValueError, struct.error) as error:
+        except (ValueError, struct.error) as error:
             raise InputError(f'cannot use {path} as a hand rig: {error}; give a .glb of a skinned hand') from error
 
     def array(self, index: int) -> Array:

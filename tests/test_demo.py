@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -72,6 +73,17 @@ def test_a_node_that_cannot_start_is_not_waited_for(tmp_path: Path, ros_domain: 
     write_bag(tmp_path / 'hand.mcap')
     assert main(['demo', '--bag', str(tmp_path / 'hand.mcap'), '--model', 'nope', '--out', str(tmp_path / 'out')]) == 1
     assert "hand-pose demo: the node does not start: there is no checkpoint named 'nope'" in capfd.readouterr().err
+
+
+def test_a_bag_that_needs_options_is_told_at_once_and_who_has_them(tmp_path: Path,
+                                                                   capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / 'uncalibrated.mcap'
+    with BagWriter(path) as bag:
+        bag.write_depth(1, 'camera', np.ones((120, 160), np.float32),
+                        SimpleNamespace(fx=0.0, fy=0.0, cx=0.0, cy=0.0, width=160, height=120))
+    assert main(['demo', '--bag', str(path), '--out', str(tmp_path / 'out')]) == 1
+    said = capsys.readouterr().err
+    assert 'give --intrinsics FX FY CX CY' in said and 'is for `hand-pose evaluate --via-ros` or' in said
 
 
 def test_the_node_ends_with_the_command_that_started_it_also_if_that_is_killed(tmp_path: Path, weights: Path,

@@ -53,6 +53,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Play the bag, draw the answers and print a summary. Returns 1 if an image got no answer."""
+    try:
+        return _run(args)
+    except InputError as error:
+        if ' --' in str(error):  # an option that other verbs have
+            raise InputError(f'{error}; {HINT}') from error
+        raise
+
+
+def _run(args: argparse.Namespace) -> int:
     from hand_pose_ros.evaluation.bag_evaluation import until_damaged
     from hand_pose_ros.ros.conversions import hand_from_msg
     from hand_pose_ros.ros.live import play_through_node

@@ -12,7 +12,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -80,9 +80,12 @@ def play_through_node(bag: DepthBag, camera_info_topic: str | None = None,
         InputError: the bag cannot be played, or two of its images have the same stamp.
     """
     stamps: Counter[int] = Counter()
-    with suppress(InputError):
+    try:
         for frame in bag:
             stamps[frame.stamp_ns] += 1
+    except InputError:
+        if not stamps:
+            raise
     if twice := [stamp for stamp, number in stamps.items() if number > 1]:
         raise InputError(f'{bag.path}: {stamps[twice[0]]} images have the stamp {twice[0]} ns, so which answer of the '
                          'node belongs to which image cannot be told: evaluate it without the node')

@@ -4,6 +4,7 @@
 
 import itertools
 import os
+import struct
 import time
 from types import SimpleNamespace
 
@@ -290,3 +291,21 @@ def test_the_command_publishes_and_counts(bag, ros_domain, capsys, monkeypatch):
         with pytest.raises(SystemExit) as leaving:
             main(['replay', str(bag), option, value, '--clock'])
         assert leaving.value.code == 2
+
+
+def test_a_loop_tells_of_damage_once_and_goes_on(tmp_path, ros_domain, capsys, monkeypatch):
+    whole, cut, ends = tmp_path / 'whole.mcap', tmp_path / 'cut.mcap', iter([False, False, True])
+    with BagWriter(whole) as writer:
+        for stamp in STAMPS:
+            writer.write_hands(stamp, 'camera', [])
+    data = whole.read_bytes()
+    cut.write_bytes(data[:data.rindex(struct.pack('<BQ', 0x0f, 4))])  # without its end
+
+    def sleep(_):  # at the end of each turn
+        if next(ends):
+            raise KeyboardInterrupt
+    monkeypatch.setattr('hand_pose_ros.ros.replay.time', SimpleNamespace(monotonic=time.monotonic, sleep=sleep))
+    assert main(['replay', str(cut), '--loop', '--rate', '1000', '--wait', '0']) == 0
+    said = capsys.readouterr()
+    assert f'{3 * len(STAMPS)}  /hand/joints' in said.out
+    assert said.err.count('cut.mcap: the bag was cut short') == 1

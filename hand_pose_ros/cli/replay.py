@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 from hand_pose_ros.cli.arguments import number
+from hand_pose_ros.errors import InputError
 
 DESCRIPTION = 'Publish a bag (ROS 1, sqlite3, MCAP) on ROS 2 topics, with its recorded types and stamps.'
 
@@ -46,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     """Play until the end of the bag, or with --loop until Ctrl-C. Returns 1 if Ctrl-C came before the end.
 
     Raises:
-        HandPoseError: there is no ROS, or the bag cannot be read.
+        HandPoseError: there is no ROS, the bag cannot be read, or it is damaged and there is no --loop.
     """
     if not 0 < args.rate <= _MAX:
         args.parser.error(f'--rate {args.rate:g}: must be more than 0 and at most {_MAX:g}')
@@ -62,9 +64,19 @@ def run(args: argparse.Namespace) -> int:
         code = 0
         try:
             replay.wait_for_subscribers(args.wait)
-            replay.play(args.start)
-            while args.loop:
-                replay.play(args.start)
+            said = False
+            while True:
+                before = sum(replay.published.values())
+                try:
+                    replay.play(args.start)
+                except InputError as error:
+                    if not args.loop or sum(replay.published.values()) == before:
+                        raise
+                    if not said:
+                        print(f'NOTE: {error}; the loop starts again at the damage', file=sys.stderr)
+                    said = True
+                if not args.loop:
+                    break
         except KeyboardInterrupt:
             code = int(not args.loop)  # a loop ends this way
         finally:

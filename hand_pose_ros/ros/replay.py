@@ -117,16 +117,22 @@ class Replay:
         if first is None:
             raise InputError(f'{self._bag.path}: nothing was recorded later than {start_s} s: give a smaller --start')
         first_ns, self._origin = first[1], time.monotonic()
-        for connection, recorded_ns, data in chain(latched, [first], messages):
-            message = self._to_ros2(connection, data)
-            self._wait_for(max(recorded_ns, first_ns), first_ns)
-            if ready is not None and not self._hold(ready):
-                ready = None
-            self._outputs[connection.topic].publish(message)
-            self.published[connection.topic] += 1
+        damage = None
+        try:
+            for connection, recorded_ns, data in chain(latched, [first], messages):
+                message = self._to_ros2(connection, data)
+                self._wait_for(max(recorded_ns, first_ns), first_ns)
+                if ready is not None and not self._hold(ready):
+                    ready = None
+                self._outputs[connection.topic].publish(message)
+                self.published[connection.topic] += 1
+        except InputError as error:  # what was published before is still on its way
+            damage = error
         for output in self._outputs.values():
             output.wait_for_all_acked(Duration(seconds=1))
         time.sleep(SETTLE_S)  # best effort is not acknowledged; messages on the way are lost when the publisher closes
+        if damage is not None:
+            raise damage
 
     def close(self) -> None:
         """Destroy the node and its topics."""

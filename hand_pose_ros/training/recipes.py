@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import dataclasses
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -98,13 +97,15 @@ EPOCH_OF_ENDLESS_DATA = 72_757
 _CHOICES = {'loss': ('huber', 'smooth_l1', 'squared'), 'optimizer': ('sgd', 'rmsprop', 'adamw', 'muon'),
             'schedule': ('constant', 'hyperbolic', 'cosine'), 'precision': ('float32', 'bfloat16')}
 
+_MOST = 10**12
+"""More than any number of a recipe needs, and less than infinity."""
 _RANGES: dict[str, tuple[float, float]] = {
-    'knee': (1e-6, math.inf), 'learning_rate': (1e-9, math.inf), 'seed': (0, MAX_SEED - 1), 'rotation_deg': (0, 180),
+    'knee': (1e-6, _MOST), 'learning_rate': (1e-9, _MOST), 'seed': (0, MAX_SEED - 1), 'rotation_deg': (0, 180),
     'scale': (1, 2), **dict.fromkeys(('jitter', 'noise'), (0, 0.1)),
-    **dict.fromkeys(('first_shard', 'last_shard', 'weight_decay'), (0, math.inf)),
+    **dict.fromkeys(('first_shard', 'last_shard', 'weight_decay'), (0, _MOST)),
     **dict.fromkeys(('warmup', 'momentum', 'average', 'jitter_tail', 'dropout', 'erase', 'mirror'), (0, 1)),
 }
-"""Least and greatest value of a number of a recipe or its augmentation. All others must be at least 1."""
+"""Least and greatest value of a number of a recipe or its augmentation. All others must be 1 to `_MOST`."""
 
 RECIPES = {
     # The paper, section 4.1. It gives neither the knee of the Huber loss nor a schedule. Ours are used.
@@ -185,7 +186,7 @@ def _replace(target: T, keys: list[str], text: str, item: str) -> T:
         value = PRESETS[text]
     else:
         value = _convert(text, fields[key], item, getattr(target, key))
-        least, most = _RANGES.get(key, (1, math.inf))
+        least, most = _RANGES.get(key, (1, _MOST))
         if type(value) in (int, float) and not least <= value <= most:  # a bool is no number here
             raise HandPoseError(f'--set {item}: must be '
                                 + (f'at least {least}' if value < least else f'at most {most}'))

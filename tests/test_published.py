@@ -192,15 +192,6 @@ def test_wrong_counts_joints_and_units_are_refused(tmp_path, uvd, capsys):
         assert caught.value.code == 2
 
 
-def test_nyu_frame_1_is_decoded_and_lies_before_its_joints(shared_data):
-    depth = tompson.read_nyu_depths(shared_data / 'frames' / 'nyu', [0])[0]
-    labels = read_text(shared_data / 'published' / 'nyu' / 'groundtruth.txt.gz', NYU.skeleton)
-    assert depth.shape == (480, 640) and depth[depth > 0].min() == pytest.approx(0.731) and depth.max() < 2
-    u, v, d = labels.uvd[0].T
-    in_front = d - 1000 * depth[np.rint(v).astype(int), np.rint(u).astype(int)]
-    assert in_front.min() > 2 and in_front.max() < 33, 'the skin lies before the joint'
-
-
 def test_2d_joints_that_are_not_there_are_told_apart_from_a_file_of_another_kind(tmp_path, capsys):
     arguments = ['evaluate', '--predictions', str(tmp_path / 'p.npz'), '--ground-truth', 'truth.txt',
                  '--dataset', 'nyu']

@@ -382,17 +382,22 @@ def test_a_report_tells_rates_times_and_the_worst_problem(monkeypatch: pytest.Mo
 
 def test_a_camera_with_less_than_an_image_a_second_is_not_stale_between_its_images(
         monkeypatch: pytest.MonkeyPatch) -> None:
-    def report(*images: float, problem: str = '') -> tuple[bytes, str]:
-        """The report of second `now`, with images that came at these times."""
+    def report(*images: float, done: str = 'answered', state: str = 'active') -> tuple[bytes, str]:
+        """The report of second `now`, with images that came at these times, and what was done with them."""
         nonlocal now
         second = now + 1
         for image_s in images:
             now = image_s
-            statistics.count(received=1, answered=1)
-            statistics.problem(problem)
+            statistics.count(received=1)
         now = second
-        status = statistics.report('node', 'active', True, {})
+        for _ in images if done else ():
+            finish(done)
+        status = statistics.report('node', state, True, {})
         return status.level, status.message
+
+    def finish(done: str) -> None:
+        statistics.count(**{done: 1})
+        statistics.problem('no readings' if done == 'refused' else '')
 
     now = 0.0
     monkeypatch.setattr('hand_pose_ros.ros.diagnostics.time', SimpleNamespace(perf_counter=lambda: now))
@@ -400,9 +405,19 @@ def test_a_camera_with_less_than_an_image_a_second_is_not_stale_between_its_imag
     nothing, one = (DiagnosticStatus.STALE, 'no images'), (DiagnosticStatus.OK, '1 image answered, 0 hands')
     assert [report(), report(1.5), report(), report(3.5), report()] == [nothing, one, one, one, one]
     warning = DiagnosticStatus.WARN, 'no readings'
-    assert [report(5.5, problem='no readings'), report()] == [warning, warning], 'no news is no good news'
+    assert [report(5.5, done='refused'), report()] == [warning, warning], 'no news is no good news'
     assert [report(7.5), report(), report(), report(), report()] == [one, one, one, one, nothing], 'it died'
     assert [report(12.2, 12.23)[0], report()] == [DiagnosticStatus.OK, nothing], 'a fast one died'
+
+    statistics, now = Statistics(), 0.0
+    assert report(0.9, done='') == (DiagnosticStatus.OK, '0 images answered, 0 hands')
+    finish('answered')
+    assert [report(), report(2.9, done='')] == [one, one], 'the answer of an image comes in the next second'
+    finish('refused')
+    assert [report(), report(4.9, done='')] == [warning, warning], 'and so does its refusal'
+    finish('answered')
+    assert report() == one
+    assert [report(6.5, state='inactive')[1], report()] == ['the node is inactive', one]
 
 
 class Graph:

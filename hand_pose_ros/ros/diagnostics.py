@@ -77,7 +77,7 @@ class Statistics:
         self._arriving: Counter[str] = Counter()
         self._arrived: Counter[str] = Counter()
         self._received_at, self._interval = -math.inf, 0.0  # seconds: of the last image, and since the one before it
-        self._told = DiagnosticStatus.STALE, 'no images'  # of the last window with an image
+        self._told = DiagnosticStatus.OK, '0 images answered, 0 hands'  # of the last window that finished an image
 
     def count(self, **counts: int) -> None:
         """Add to the named counts."""
@@ -122,7 +122,7 @@ class Statistics:
         counts = window.counts
         self._count_arrivals(counts if state == 'active' and published else Counter())
         level, message = self._judge(window, state, late)
-        if counts['received'] and not self.failure:
+        if _finished(counts) and state == 'active' and not self.failure:
             self._told = level, message
         values = {'state': state, 'input_hz': f'{counts["received"] / elapsed:.1f}',
                   'output_hz': f'{counts["answered"] / elapsed:.1f}'}
@@ -158,8 +158,8 @@ class Statistics:
             return DiagnosticStatus.WARN, (
                 f'{arrived["camera_infos"]} camera_info but only {counted(arrived["received"], "images")} arrived: if '
                 f'there should be as many, {remedy_for_lost_images()}')
-        if counts['received'] == 0:
-            return (DiagnosticStatus.STALE, 'no images') if late else self._told
+        if not _finished(counts):  # no image came, or its answer comes later
+            return (DiagnosticStatus.STALE, 'no images') if late and not counts['received'] else self._told
         # Images that wait for their camera_info are reported elsewhere.
         too_many = counts['dropped'] - counts['waited'] > MAX_DROPPED * counts['received']
         if counts['received'] >= MIN_SAMPLE and too_many:
@@ -168,3 +168,8 @@ class Statistics:
                 'slow, or too busy, for their rate')
         return DiagnosticStatus.OK, (
             f'{counted(counts["answered"], "images")} answered, {counted(counts["hands"], "hands")}')
+
+
+def _finished(counts: Counter[str]) -> int:
+    """How many images were answered, refused or dropped."""
+    return counts['answered'] + counts['refused'] + counts['dropped']

@@ -150,7 +150,7 @@ def estimate(images: Iterator[DepthInput], number: int, estimator: HandPoseEstim
         hint = f'nothing had a score of {estimator.min_score:g} or more'
         hint += ', which networks with little training do not reach' if estimator.side == 'auto' else \
             f' as a {estimator.side} hand: if it may be the other hand, leave out --side'
-        hint += ': --min-score 0 shows what is most like a hand'
+        hint += '; --min-score 0 shows what is most like a hand'
         print(f'hand-pose estimate: {problem or hint}', file=sys.stderr)
     return 1 if failed else 0
 

@@ -16,8 +16,7 @@ from hand_pose_ros.files import check_writable
 if TYPE_CHECKING:
     from hand_pose_ros.evaluation.progress import Progress
     from hand_pose_ros.models.checkpoints import Checkpoint
-    from hand_pose_ros.runtime import Engine
-    from hand_pose_ros.training.adapt import Look, Numbers
+    from hand_pose_ros.training.adapt import Look
 
 DESCRIPTION = ('Fine-tune a network to your camera, from a bag without labels, and compare it with the original '
                'on images that it did not learn from. It needs no ROS and no GPU, and takes some minutes.')
@@ -78,17 +77,16 @@ def run(args: argparse.Namespace) -> int:
     name = args.model or DEFAULT
     _check_fits(checkpoint, name)
 
-    def evaluate(model: str | None, network: torch.nn.Module, what: str) -> tuple[Look, Engine, Numbers]:
-        found = look(args.bag, Settings(model, 'cpu', estimator={'side': args.side}, bag=bag_options(args),
-                                        ground_truth=args.ground_truth), _progress(f'{what}: images'))
-        engine = make_engine(network, 'cpu')
-        return found, engine, judge(found, engine, _progress(f'{what}: comparison'))
+    def look_with(model: str | None, what: str) -> Look:
+        return look(args.bag, Settings(model, 'cpu', estimator={'side': args.side}, bag=bag_options(args),
+                                       ground_truth=args.ground_truth), _progress(f'{what}: images'))
 
-    found, engine, before = evaluate(args.model, checkpoint.network, 'before')
-    require_hands(found, args.bag)
-    for note in found.result.notes:
+    found, engine = look_with(args.model, 'before'), make_engine(checkpoint.network, 'cpu')
+    for note in found.result.notes:  # they may say why there are not enough hands
         print(f'NOTE: {note}', file=sys.stderr)
+    require_hands(found, args.bag)
     labelled = label(engine, *found.select(found.split()[0]), _progress('labels'))
+    before = judge(found, engine, _progress('before: comparison'))
     synthetic = make_shard(open_dataset('synthetic', 'train'), 0, min(1024, 16 * args.steps))
     network = fine_tune(checkpoint.network, labelled, synthetic, args.steps, _progress('training'))
 
@@ -98,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
         trial = Path(folder) / args.out.name
         save_checkpoint(trial, network, metadata)  # judge what will be written: it is rounded to half precision
         network = load_checkpoint(trial).network
-        _, _, after = evaluate(str(trial), network, 'after')
+        after = judge(look_with(str(trial), 'after'), make_engine(network, 'cpu'), _progress('after: comparison'))
     test = [make_shard(open_dataset('synthetic', 'test'), 0, CHECKED)]
     errors = [1000 * float((joints - truth).norm(dim=-1).mean()) for joints, truth in
               (estimate(each, test, torch.device('cpu')) for each in (checkpoint.network, network))]

@@ -324,8 +324,12 @@ def test_a_folder_without_metadata_is_read(tmp_path, depths):
     (path / 'metadata.yaml').unlink()
     assert_same(path, depths)
     shutil.copy(path / 'folder.mcap', path / 'folder_1.mcap')  # which of several is to be read first?
-    with pytest.raises(InputError, match=r'folder: .* `ros2 bag reindex .*folder`'):
+    with pytest.raises(InputError, match=r'folder: there is no metadata\.yaml .* `ros2 bag reindex .*folder`'):
         DepthBag(path)
+    (tmp_path / 'damaged').mkdir()
+    (tmp_path / 'damaged' / 'a_0.db3').write_text('x')
+    with pytest.raises(InputError, match=r'a_0\.db3: .* database .* `sqlite3 .*/a_0\.db3 \.recover'):
+        DepthBag(tmp_path / 'damaged')
 
 
 @pytest.mark.parametrize(('name', 'remedy'), [

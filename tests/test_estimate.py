@@ -247,11 +247,11 @@ def test_the_folder_of_a_bag_may_lack_its_metadata(tmp_path, bag, command, capsy
     (tmp_path / 'empty').mkdir()
     assert command(tmp_path / 'empty', '--out', tmp_path / 'never.npz') == 1
     assert 'neither 16-bit depth .png files nor a bag' in capsys.readouterr().err
-    for name in 'metadata.yaml', 'recording_0.db3':  # also what is damaged is a bag
+    for name, told in (('metadata.yaml', ''), ('recording_0.db3', '/recording_0.db3')):  # also what is damaged is a bag
         (damaged := tmp_path / f'with {name}').mkdir()
         (damaged / name).write_text('x')
         assert command(damaged, '--out', tmp_path / 'never.npz') == 1
-        assert f'{damaged}: the bag cannot be opened' in capsys.readouterr().err
+        assert f'{damaged}{told}: the bag cannot be opened' in capsys.readouterr().err
 
 
 def test_nothing_usable_writes_nothing(tmp_path, command, capsys):

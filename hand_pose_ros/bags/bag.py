@@ -128,8 +128,12 @@ def _open(path: Path) -> tuple[AnyReader, bool]:
     """A reader of the bag, and whether it reads only what an interrupted recording has left."""
     if not path.exists():
         raise InputError(f'{path}: there is no such bag: check the path')
-    attempts: list[Any] = [PathForSqlite(path)]
     files = [file for kind in ('mcap', 'db3') for file in path.glob(f'*.{kind}')] if path.is_dir() else [path]
+    if path.is_dir() and not (path / 'metadata.yaml').exists():
+        if len(files) != 1:
+            raise InputError(f'{path}: there is no metadata.yaml in this folder; {_remedy(path)}')
+        path = files[0]
+    attempts: list[Any] = [PathForSqlite(path)]
     if len(files) == 1:
         if path.is_dir():
             attempts.append(PathForSqlite(files[0]))

@@ -95,6 +95,8 @@ def run(args: argparse.Namespace) -> int:
     """Evaluate, write the outputs and print the numbers. Returns 1 if a bag failed or is damaged."""
     if bool(args.bags) == bool(args.predictions):
         args.parser.error('give either bags or --predictions')
+    if twice := [bag for bag in args.bags if args.bags.count(bag) > 1]:  # both would write the same files
+        args.parser.error(f'{twice[0]} is given twice: give it once')
     if args.out and len(args.bags) < 2 and Path(args.out).suffix != '.npz':
         args.parser.error(f'--out {args.out}: the result is an .npz file')
     out = Path(args.out) / 'any.npz' if args.out and len(args.bags) > 1 else args.out

@@ -297,6 +297,8 @@ def test_many_results_with_long_names_can_be_told_apart(result):
             assert not around.overlaps(inside) and around.height > figure.bbox.height / 5, 'no curve is covered'
     lines = plots.curves(many).axes[0].lines
     assert len({(line.get_color(), line.get_linestyle()) for line in lines}) == 20
+    bars = [bar[0] for bar in plots.joint_bars(many).axes[0].containers]
+    assert len({(bar.get_facecolor(), bar.get_hatch()) for bar in bars}) == 20
 
 
 def tiles(html):

@@ -24,6 +24,8 @@ from hand_pose_ros.files import write_bytes
 COLORS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9', '#000000', '#B8A800')
 LINES = ('-', '--', ':', '-.')
 """Line styles, for curves that share a color."""
+HATCHES = ('', '////', '....', 'xxxx')
+"""The same for bars."""
 LINE_INCHES = 0.19
 """Height of an entry of a legend."""
 LONGEST = 80
@@ -72,8 +74,8 @@ def joint_bars(results: Sequence[Result]) -> Figure:
     width = 0.8 / len(results)
     for k, (result, color) in enumerate(_colored(results)):
         means = metrics.per_joint_mm(result.errors_mm)
-        axes.bar(np.arange(len(skeleton)) + (k + 0.5) * width - 0.4, means, width * 0.92, color=color,
-                 label=_entry(result))
+        axes.bar(np.arange(len(skeleton)) + (k + 0.5) * width - 0.4, means, width * 0.92, color=color, lw=0,
+                 ec='white', hatch=HATCHES[k // len(COLORS) % len(HATCHES)], label=_entry(result))
     axes.set_xticks(range(len(skeleton)), [name.replace('_', ' ') for name in skeleton.joint_names],
                     rotation=45, ha='right', rotation_mode='anchor')
     axes.set(title='Error of each joint', ylabel='mean error, mm', xlim=(-0.6, len(skeleton) - 0.4))

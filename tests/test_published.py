@@ -152,7 +152,7 @@ def test_names_on_both_sides_decide_what_belongs_together(tmp_path, uvd):
     (lambda lines: [lines[0], lines[1].replace(' ', ' 1,5 ', 1), *lines[2:]], 'line 2 has 43 numbers'),
     (lambda lines: [*lines[:4], lines[4].rpartition(' ')[0] + ' 1,5'], "line 5 has '1,5' where a number belongs"),
     (lambda lines: [line.replace(' ', ',') for line in lines], 'line 1 has 0 numbers.*with blanks between them'),
-    (lambda lines: ['', ''], 'no line with joints'),
+    (lambda lines: ['', ''], 'no line with joints in it: give'),
     (lambda lines: [f'a.png {lines[0]}', *lines[1:]], '1 of 5 lines begin with a file name'),
 ])
 def test_bad_lines_are_named(tmp_path, uvd, change, message):

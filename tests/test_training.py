@@ -521,7 +521,10 @@ def test_command_line(tmp_path, folder, capsys):
     assert main(['train', 'papers', '--out', str(tmp_path)]) == 1
     assert "unknown recipe 'papers'" in capsys.readouterr().err
     assert main(['train', '--resume', '--out', str(tmp_path)]) == 1
-    assert 'holds no run to resume' in capsys.readouterr().err
+    assert 'give the folder of a run, or begin one without --resume' in capsys.readouterr().err
+    (tmp_path / 'config.json').write_text('{}')
+    assert main(['train', '--resume', '--out', str(tmp_path)]) == 1
+    assert 'begin another run in another folder' in capsys.readouterr().err
     for wrong in (['train', '--out', str(tmp_path)], ['train', 'paper', '--out', str(tmp_path), '--resume']):
         with pytest.raises(SystemExit) as error:
             main(wrong)

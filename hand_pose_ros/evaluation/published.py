@@ -113,7 +113,7 @@ def read_text(path: str | Path, skeleton: Skeleton) -> Labels:
             raise InputError(f"{path}: line {number} has '{wrong}' where a number belongs "
                              '(write nan for a missing joint)') from None
     if not rows:
-        raise InputError(f'{path}: there is no line with joints in it')
+        raise InputError(f'{path}: there is no line with joints in it: give a file that has some')
     if names and len(names) != len(rows):
         raise InputError(f'{path}: {len(names)} of {len(rows)} lines begin with a file name: '
                          'give all of them one, or none')

@@ -47,9 +47,11 @@ class RunFolder:
         try:
             return recipe_from_dict(json.loads((self.path / 'config.json').read_text())['recipe'])
         except FileNotFoundError:
-            raise TrainingError(f'{self.path} holds no run to resume: there is no config.json in it') from None
+            raise TrainingError(f'{self.path} holds no run to resume, for there is no config.json in it: give the '
+                                'folder of a run, or begin one without --resume') from None
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise TrainingError(f'{self.path} holds no run to resume ({error})') from error
+            raise TrainingError(f'{self.path} holds no run to resume, for its config.json cannot be used ({error}): '
+                                'begin another run in another folder') from error
 
     def require_none(self) -> None:
         """Raise TrainingError if the folder holds a run already."""

@@ -200,8 +200,13 @@ def test_mistakes_are_named():
         build('deep', dropout=2)
     with pytest.raises(HandPoseError, match='width 1: give at least 2'):
         build('hand_finder', width=1)
+    for channels in [], [32], [1, 2, 3]:
+        with pytest.raises(HandPoseError, match='give two numbers or more, each at least 4'):
+            build('resnet', channels=channels)
+    with pytest.raises(HandPoseError, match=r'hidden \[96, 0\]: give numbers of at least 1'):
+        build('or_ref', hidden=[96, 0])
     with pytest.raises(HandPoseError, match="'resnet' cannot be made with"):
-        build('resnet', channels=[32])
+        build('resnet', last_stride=100)
     with pytest.raises(HandPoseError, match='does not take depth: it takes joints'):
         build('deep', depth=3)
     with pytest.raises(HandPoseError, match='without a bottleneck'):

@@ -62,7 +62,7 @@ def build(architecture: str, **config: Any) -> nn.Module:
     arguments.apply_defaults()  # a checkpoint must not depend on the defaults of the version that reads it
     try:
         network = make(**arguments.arguments)
-    except (TypeError, ValueError, RuntimeError, IndexError) as error:
+    except (TypeError, ValueError, RuntimeError) as error:
         raise HandPoseError(f"architecture '{architecture}' cannot be made with {config}: {error}") from error
     vars(network).update(architecture=architecture, config=dict(arguments.arguments))
     return network

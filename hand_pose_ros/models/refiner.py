@@ -16,6 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.geometry import PATCH_SIZE
 from hand_pose_ros.models.prior_net import relu_conv
 
@@ -50,11 +51,16 @@ class Refiner(nn.Module):
         regions: one for each branch.
         hidden: widths of the fully connected layers after the branches.
         dropout: share of the units of these layers that are dropped while training.
+
+    Raises:
+        HandPoseError: one of `hidden` is less than 1.
     """
 
     def __init__(self, joints: int, regions: tuple[Region, ...], hidden: tuple[int, ...],
                  dropout: float) -> None:
         super().__init__()
+        if min(hidden, default=1) < 1:
+            raise HandPoseError(f'hidden {list(hidden)}: give numbers of at least 1')
         self.joints, self.regions = joints, regions
         self.branches = nn.ModuleList(nn.Sequential(*_branch(joints, region.layers)) for region in regions)
         features = 0

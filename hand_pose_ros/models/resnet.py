@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor, nn
 
+from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.models.prior_net import PoseNetwork, relu_conv
 
 
@@ -19,11 +20,16 @@ class ResNet(PoseNetwork):
         last_stride: stride of the last stage. 1 is the network that the authors' code builds (18.7 M parameters with 14
             joints), because it asks an identity for a stride of 2, which has none. 2 is the network that was meant
             (6.2 M parameters, and faster).
+
+    Raises:
+        HandPoseError: `channels` are not two numbers or more of at least 4.
     """
 
     def __init__(self, joints: int = 21, bottleneck: int | None = 30, dropout: float = 0.3,
                  channels: tuple[int, ...] = (32, 64, 128, 256, 256), blocks: int = 5,
                  last_stride: int = 1) -> None:
+        if len(channels) < 2 or min(channels) < 4:
+            raise HandPoseError(f'channels {list(channels)}: give two numbers or more, each at least 4')
         stem, *stages = channels
         layers: list[nn.Module] = [relu_conv(1, stem, 5, padding=2), nn.MaxPool2d(2)]
         for inputs, outputs in zip(channels, stages, strict=False):

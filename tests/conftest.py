@@ -1,5 +1,6 @@
 """Fixtures for every test: the recorded data, weights, and a ROS domain of one's own."""
 
+import functools
 import itertools
 import os
 import socket
@@ -36,6 +37,17 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp('weights') / 'untrained.safetensors'
     save_checkpoint(path, build('deep_prior', joints=21), {'skeleton': 'hand21', 'cube_side': 0.3})
     return path
+
+
+@pytest.fixture(scope='module')
+def load_once() -> Iterator[None]:
+    """Where many estimators are made of the same weights, to load them each time would take most of the time."""
+    from hand_pose_ros import estimator
+    with pytest.MonkeyPatch.context() as patch:
+        for where, name in ((estimator, 'load_checkpoint'), (estimator, 'make_engine'),
+                            (estimator.Finder, 'from_pretrained')):
+            patch.setattr(where, name, functools.cache(getattr(where, name)))
+        yield
 
 
 @pytest.fixture

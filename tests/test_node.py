@@ -1,6 +1,5 @@
 """How the node answers images: each once, with its stamp and frame, the newest first. The real node, over real DDS."""
 
-import functools
 import threading
 import time
 from array import array
@@ -26,7 +25,6 @@ from rclpy.task import Future
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from visualization_msgs.msg import Marker, MarkerArray
 
-from hand_pose_ros import estimator as estimator_module
 from hand_pose_ros.depth import encode_compressed
 from hand_pose_ros.msg import HandJointsArray, HandSkeleton
 from hand_pose_ros.ros import conversions
@@ -35,21 +33,12 @@ from hand_pose_ros.ros.topics import input_topics
 from hand_pose_ros.ros.worker import NewestWorker
 from hand_pose_ros.skeleton import HAND21
 
-pytestmark = pytest.mark.usefixtures('ros_domain')
+pytestmark = pytest.mark.usefixtures('ros_domain', 'load_once')
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 140.0
 BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-
-
-@pytest.fixture(scope='module', autouse=True)
-def _load_once() -> Iterator[None]:
-    """Many nodes are started here, with the same weights: loading them each time would take most of the time."""
-    with pytest.MonkeyPatch.context() as patch:
-        for name in ('load_checkpoint', 'make_engine'):
-            patch.setattr(estimator_module, name, functools.cache(getattr(estimator_module, name)))
-        yield
 
 
 def depth_with_hand(z: float = 0.6) -> np.ndarray:

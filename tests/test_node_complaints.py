@@ -22,7 +22,6 @@ from test_node import (  # noqa: F401 (fixtures)
     RELIABLE,
     WIDTH,
     Rig,
-    _load_once,
     camera_info,
     depth_with_hand,
     image,
@@ -34,7 +33,7 @@ from test_node import (  # noqa: F401 (fixtures)
 from hand_pose_ros.msg import HandJointsArray
 from hand_pose_ros.ros import node as node_module
 
-pytestmark = pytest.mark.usefixtures('ros_domain')
+pytestmark = pytest.mark.usefixtures('ros_domain', 'load_once')
 
 
 def test_without_camera_info_the_remedy_is_named_and_works(rig: Rig) -> None:

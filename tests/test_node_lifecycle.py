@@ -20,12 +20,12 @@ from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from std_srvs.srv import SetBool, Trigger
-from test_node import Rig, _load_once, camera_info, depth_with_hand, image, rig  # noqa: F401 (fixtures)
+from test_node import Rig, camera_info, depth_with_hand, image, rig  # noqa: F401 (fixtures)
 from visualization_msgs.msg import Marker, MarkerArray
 
 from hand_pose_ros.msg import HandJointsArray
 
-pytestmark = pytest.mark.usefixtures('ros_domain')
+pytestmark = pytest.mark.usefixtures('ros_domain', 'load_once')
 
 COMMAND = [sys.executable, '-m', 'hand_pose_ros.cli']
 

@@ -24,7 +24,6 @@ from test_node import (  # noqa: F401 (fixtures)
     RELIABLE,
     WIDTH,
     Rig,
-    _load_once,
     camera_info,
     depth_with_hand,
     image,
@@ -53,7 +52,7 @@ from hand_pose_ros.ros.params import Params
 from hand_pose_ros.ros.watch import _Watcher, watch
 from hand_pose_ros.skeleton import HAND21
 
-pytestmark = pytest.mark.usefixtures('ros_domain')
+pytestmark = pytest.mark.usefixtures('ros_domain', 'load_once')
 
 
 def xyz(points) -> np.ndarray:

@@ -293,7 +293,7 @@ def test_what_is_wrong_with_a_bag_is_said(tmp_path, model, capsys):
     (photo := tmp_path / 'photo.jpg').write_bytes(b'\xff\xd8\xff\xe0')
     for bag, more, message in ((empty, (), 'it is empty: record or copy it again'),
                                (photo, (), 'give a .bag, .mcap or .db3 file or the folder of a ROS 2 bag\n'),
-                               (two, (), 'choose one of /left/depth, /right/depth'),
+                               (two, (), 'choose one with --depth-topic: /left/depth, /right/depth'),
                                (tmp_path / 'none.mcap', (), 'there is no such bag')):
         assert main(arguments(bag, model, *more)) == 1
         assert message in capsys.readouterr().err

@@ -54,11 +54,6 @@ class Skeleton:
             chain.append(self.parents[chain[-1]])
         return tuple(chain)
 
-    @property
-    def tips(self) -> tuple[int, ...]:
-        """Indices of the fingertips, from thumb to little finger."""
-        return tuple(self.joint_names.index(f'{finger}_tip') for finger in FINGERS)
-
 
 def _hand(name: str, joints: str, parents: tuple[int, ...]) -> Skeleton:
     return Skeleton(name, tuple(joints.split()), parents)

@@ -10,6 +10,8 @@ from hand_pose_ros.drawing import FINGER_COLORS, close_up, contact_sheet, overla
 from hand_pose_ros.geometry import Cube, Intrinsics
 from hand_pose_ros.skeleton import HAND21
 
+TIPS = range(4, 21, 4)
+
 
 @pytest.fixture
 def drawn():
@@ -40,7 +42,7 @@ def test_joints_are_drawn_where_they_are_in_the_colour_of_their_finger(drawn):
     twice = Intrinsics(800.0, 800.0, 2 * 170.5 - 0.5, 2 * 110.5 - 0.5, 640, 480)
     # The close-up shows the cube: its centre in the middle, its side as wide as the picture.
     cube = Intrinsics(800.0, 800.0, 239.5, 239.5, 480, 480)
-    for tip in HAND21.tips:
+    for tip in TIPS:
         color = FINGER_COLORS[HAND21.fingers[tip]]
         assert color_at(picture, hand.joints[tip], twice) == color
         assert color_at(picture[:, 640:], hand.joints[tip], cube) == color
@@ -90,7 +92,7 @@ def test_the_nearest_joint_is_on_top(drawn):
     depth, camera, hand = drawn
     for z in (0.45, 0.55):
         joints = np.full((21, 3), np.nan)
-        joints[list(HAND21.tips[:2])] = np.array([0.1, 0.1, 1]) * [[0.5], [z]]
+        joints[list(TIPS[:2])] = np.array([0.1, 0.1, 1]) * [[0.5], [z]]
         picture = close_up(depth, camera, hand.cube, joints)
         cube = Intrinsics(800.0, 800.0, 239.5, 239.5, 480, 480)
         assert color_at(picture, joints[4], cube) == FINGER_COLORS['index' if z < 0.5 else 'thumb']
@@ -100,10 +102,10 @@ def test_joints_that_are_nowhere_are_not_drawn(drawn):
     depth, camera, hand = drawn
     whole, nothing = (close_up(depth, camera, hand.cube, joints) for joints in (hand.joints, np.full((21, 3), np.nan)))
     aside = hand.joints.copy()
-    aside[HAND21.tips[1], 0] = 1e8
+    aside[TIPS[1], 0] = 1e8
     assert (close_up(depth, camera, hand.cube, aside) != whole).any()  # whose pixel no integer holds
     for nowhere in (np.nan, np.inf, 0.0):
-        for joint in (HAND21.tips[1], HAND21.tips[1] - 1):  # nor are bones from or to them
+        for joint in (TIPS[1], TIPS[1] - 1):  # nor are bones from or to them
             joints = hand.joints.copy()
             joints[joint] = nowhere
             picture = close_up(depth, camera, hand.cube, joints)

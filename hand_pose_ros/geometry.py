@@ -40,9 +40,10 @@ class Intrinsics:
         if not (np.isfinite(values).all() and self.fx > 0 and self.fy > 0):
             raise InputError(
                 f'camera intrinsics fx={self.fx}, fy={self.fy}, cx={self.cx}, cy={self.cy} are not usable: '
-                'the focal lengths must be positive and all four finite (is the camera calibrated?)')
+                'focal lengths must be positive, and all four finite: calibrate the camera')
         if self.width <= 0 or self.height <= 0:
-            raise InputError(f'camera intrinsics are for an image of {self.width}x{self.height} pixels, which is empty')
+            raise InputError(f'camera intrinsics are for an image of {self.width}x{self.height} pixels, which is '
+                             'empty: give its size')
 
     @classmethod
     def from_camera_info(cls, info: Any, *, rectified: bool = True) -> Intrinsics:

@@ -213,9 +213,11 @@ def test_an_image_waits_for_the_camera_info_that_fits_it_and_no_longer() -> None
     now = Params(camera_info_timeout=0.0)
     with pytest.raises(InputError, match=r'^/camera_info: .*640x480'):
         camera.intrinsics(320, 240, now)
-    camera.update(info(k=[0.0] * 9))
-    with pytest.raises(InputError, match=r'calibrate it, or set the parameters intrinsics\.fx, \.fy, \.cx and \.cy$'):
-        camera.intrinsics(640, 480, now)
+    for wrong, remedy in ((info(k=[0.0] * 9), 'calibrate it'), (info(k=[-1.0] * 9), 'calibrate the camera'),
+                          (info(width=0), 'give its size')):
+        camera.update(wrong)
+        with pytest.raises(InputError, match=rf'{remedy}, or set the parameters intrinsics\.fx, \.fy, \.cx and \.cy$'):
+            camera.intrinsics(640, 480, now)
 
 
 def test_depth_that_cannot_hold_a_hand_is_explained() -> None:

@@ -31,7 +31,7 @@ difference on these frames is more than chance.
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the verb takes."""
     parser.add_argument('results', nargs='+', metavar='[NAME=]FILE',
-                        help='an .npz of `hand-pose evaluate --out`, or a text file of predictions')
+                        help='an .npz of `hand-pose evaluate --out` with ground truth, or a text file of predictions')
     parser.add_argument('--ground-truth', metavar='G', help='labels for the results that are text files')
     parser.add_argument('--dataset', choices=sorted(DATASETS),
                         help='joints and camera of the results that are text files')

@@ -18,7 +18,7 @@ EXAMPLES = """examples:
   hand-pose replay recording.mcap --ros-args -r /camera/depth/image_rect_raw:=/depth/image_rect \\
                                              -r /camera/depth/camera_info:=/depth/camera_info
 
-While it plays, pause (true) and continue (false) with
+Pause (true) and continue (false) with
   ros2 service call /replay/pause std_srvs/srv/SetBool "{data: true}"
 """
 _MAX = 1e9
@@ -32,8 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--rate', type=number, default=1.0, metavar='X', help='play X times as fast as recorded (1)')
     parser.add_argument('--loop', action='store_true', help='start again at the end, until Ctrl-C')
     parser.add_argument('--start', type=number, default=0.0, metavar='S', help='begin S seconds into the bag (0)')
-    parser.add_argument('--start-paused', action='store_true',
-                        help='start paused, until the service /replay/pause is called')
+    parser.add_argument('--start-paused', action='store_true', help='start paused; continue as below')
     parser.add_argument('--clock', action='store_true', help='publish /clock, for nodes with use_sim_time')
     parser.add_argument('--qos', default='recorded', choices=('recorded', 'reliable', 'best_effort'),
                         help='reliability of the publishers (recorded; ROS 1 bags: reliable)')

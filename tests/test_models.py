@@ -191,8 +191,8 @@ def test_mistakes_are_named():
         build('deeper')
     for name, wrong, wanted in (
             ('blocks', 2, 'whole numbers, for example 1,1,1,1'), ('blocks', (1, 'x', 1, 1), 'whole numbers'),
-            ('width', 'x', 'a whole number'), ('width', -8, 'at least 1'), ('refined', 'no', 'true or false'),
-            ('bottleneck', 2.5, 'a whole number, or none')):
+            ('width', 'x', 'a whole number of at least 1$'), ('width', -8, 'a whole number of at least 1'),
+            ('refined', 'no', 'true or false'), ('bottleneck', 2.5, 'a whole number of at least 0, or none')):
         for architecture in ('hand_dense', 'two_looks'):
             with pytest.raises(HandPoseError, match=f'^{architecture} cannot have {name}=.*: give {wanted}'):
                 build(architecture, **{name: wrong})

@@ -70,17 +70,18 @@ def build(architecture: str, **config: Any) -> nn.Module:
 
 def _wanted(value: Any, parameter: inspect.Parameter) -> str:
     """What to give instead of a value of the wrong type or out of range. It is empty if the value may do."""
-    kind, *none = parameter.annotation.split(' | ')
-    if (value is None and none) or kind.startswith('dict'):
-        return ''
+    kind, default = parameter.annotation, parameter.default
     if kind == 'bool':  # 'no' would be true
-        return '' if isinstance(value, bool) else 'true or false'
-    if kind not in ('int', 'float'):
+        fits, wanted = isinstance(value, bool), 'true or false'
+    elif kind == 'float':  # dropout
+        fits, wanted = type(value) in (int, float) and 0 <= value <= 1, 'a number from 0 to 1'
+    elif kind in ('int', 'int | None'):
+        least, none = min(default or 0, 1), kind != 'int'
+        fits = (type(value) is int and value >= least) or (none and value is None)
+        wanted = f'a whole number of at least {least}' + ', or none' * none
+    elif 'int' in kind:
         fits = isinstance(value, list | tuple) and all(type(number) is int for number in value)
-        return '' if fits else f'whole numbers, for example {",".join(map(str, parameter.default))}'
-    if type(value) not in ((int,) if kind == 'int' else (int, float)):
-        return f'a {"whole " * (kind == "int")}number{", or none" * bool(none)}'
-    if kind == 'float':  # dropout
-        return '' if 0 <= value <= 1 else 'a number from 0 to 1'
-    least = min(parameter.default or 0, 1)
-    return '' if value >= least else f'at least {least}'
+        wanted = f'whole numbers, for example {",".join(map(str, default))}'
+    else:  # the options of another network
+        return ''
+    return '' if fits else wanted

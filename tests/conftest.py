@@ -7,6 +7,7 @@ import socket
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 
@@ -43,27 +44,27 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def load_once() -> Iterator[None]:
     """Where many estimators are made of the same weights, to load them each time would take most of the time."""
     from hand_pose_ros import estimator
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as caching:
         for where, name in ((estimator, 'load_checkpoint'), (estimator, 'make_engine'),
                             (estimator.Finder, 'from_pretrained')):
-            patch.setattr(where, name, functools.cache(getattr(where, name)))
+            caching.setattr(where, name, functools.cache(getattr(where, name)))
         yield
 
 
 @pytest.fixture
-def ros_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
-    """A ROS_DOMAIN_ID that no other test on this machine uses at the same time; also in the environment.
+def ros_domain() -> Iterator[int]:
+    """A ROS_DOMAIN_ID that no other test on this machine uses at the same time; also in the environment, which is
+    afterwards as before: commands set the profile of DDS there.
 
     Ask for it before rclpy.init(), or for a whole file: `pytestmark = pytest.mark.usefixtures("ros_domain")`.
     """
-    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    with socket.socket() as lock:
+    with socket.socket() as lock, patch.dict(os.environ, ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST'):
         for number in _numbers:
             domain = 1 + number % 100  # above 101 the ports meet the ephemeral ones
             with suppress(OSError):  # another test has this domain
                 lock.bind(('127.0.0.1', 7400 + 250 * domain))  # over TCP, DDS does not use its port
                 break
-        monkeypatch.setenv('ROS_DOMAIN_ID', str(domain))
+        os.environ['ROS_DOMAIN_ID'] = str(domain)
         yield domain
 
 

@@ -15,7 +15,7 @@ pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
 import yaml
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, Image, RegionOfInterest
+from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
@@ -138,13 +138,6 @@ def test_a_bad_projection_matrix_does_not_hold_up_raw_images() -> None:
     assert camera.intrinsics(640, 480, Params(use_rectified=False)).fx == 500
 
 
-def test_binning_and_region_of_interest() -> None:
-    camera = Camera('/camera_info')
-    camera.update(info(binning_x=2, binning_y=2,
-                       roi=RegionOfInterest(x_offset=100, y_offset=40, width=320, height=240)))
-    assert camera.intrinsics(160, 120, Params()) == Intrinsics(250, 255, 110, 100, 160, 120)
-
-
 @pytest.mark.parametrize('k', [
     [1e-300, 0, 320, 0, 1e-300, 240, 0, 0, 1], [1e9, 0, 320, 0, 1e9, 240, 0, 0, 1],
     [500, 0, 1e300, 0, 500, 240, 0, 0, 1], [60, 0, 320, 0, 60, 240, 0, 0, 1]])
@@ -154,6 +147,10 @@ def test_intrinsics_of_no_lens_are_refused(k: list[float]) -> None:
     camera.update(info(k=k))
     with pytest.raises(InputError, match=r'^/camera_info: .* no camera of 640x480 pixels'):
         camera.intrinsics(640, 480, Params())
+
+
+def test_parameters_of_no_lens_are_refused() -> None:
+    camera = Camera('/camera_info')
     given_ = Params(intrinsics_fx=1e-5, intrinsics_fy=1e-5, intrinsics_cx=320.0, intrinsics_cy=240.0)
     with pytest.raises(InputError, match=r'^parameters intrinsics\.\*: .* no camera of 640x480 pixels'):
         camera.intrinsics(640, 480, given_)

@@ -194,16 +194,6 @@ def test_a_mirrored_scene_gives_mirrored_joints_of_the_other_hand(estimator, seq
     assert np.abs(other.joints * (-1, 1, 1) - hand.joints).max() < (0.005 if dense else 0.010 if refined else 0.015)
 
 
-def test_a_side_that_is_settled_is_not_asked_again_in_every_image(sequence, monkeypatch):
-    """Looking at both mirrorings costs twice the time: only a new hand, and now and then a tracked one, is worth it."""
-    estimator = HandPoseEstimator.from_pretrained(DEFAULT, device='cpu')
-    run_full, shown = estimator.engine.run_full, []
-    monkeypatch.setattr(estimator.engine, 'run_full', lambda patches: shown.append(len(patches)) or run_full(patches))
-    sides = [estimator(frame.depth, frame.intrinsics)[0].side for frame in sequence]
-    assert len(set(sides[5:])) == 1
-    assert shown[0] == 2 and shown.count(1) > len(sequence) / 2 and 2 in shown[len(shown) // 2:]
-
-
 def test_results_repeat_to_the_bit(estimator, sequence):
     runs = []
     for _ in range(2):

@@ -212,13 +212,6 @@ def test_every_image_is_answered_once_with_its_own_stamp_and_frame(rig: Rig, qos
     assert (hand.cube_center.x, hand.cube_center.y, hand.cube_center.z) == pytest.approx((0, 0, 0.6), abs=0.15)
 
 
-@pytest.mark.parametrize('encoding', ['16UC1', '32FC1'])
-def test_both_encodings_give_the_same_hand(rig: Rig, encoding: str) -> None:
-    rig.start(tracking=False)
-    answer = rig.answer(rig.camera(info=camera_info()), image(depth_with_hand(), encoding=encoding))
-    assert len(answer.hands) == 1
-
-
 def test_no_hand_is_an_empty_answer_and_takes_the_markers_away(rig: Rig) -> None:
     rig.start(marker_lifetime=2.0)
     publish = rig.camera(info=camera_info())
@@ -281,15 +274,6 @@ def test_a_topic_may_be_named_with_its_transport(rig: Rig) -> None:
     infos.publish(camera_info())
     layout, data = encode_compressed(depth_with_hand())
     assert len(rig.answer(publish, stamped(CompressedImage(format=layout, data=array('B', data)), 5, 'x')).hands) == 1
-
-
-def test_a_remapped_image_takes_its_camera_info_along(rig: Rig) -> None:
-    rig.start('depth/image_rect:=/front/depth/image_raw')
-    publish = rig.camera(topic='/front/depth/image_raw')
-    infos = rig.client.create_publisher(CameraInfo, '/front/depth/camera_info', RELIABLE)
-    rig.connected(infos)
-    infos.publish(camera_info())
-    assert rig.answer(publish, image(depth_with_hand())).hands
 
 
 @pytest.mark.parametrize('remaps, transport, topics', [

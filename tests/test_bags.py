@@ -53,9 +53,11 @@ def write_ros1(path, depths, camera_first=True, encoding='16UC1'):
     store = get_typestore(Stores.ROS1_NOETIC)
     types, kinds = store.types, ('sensor_msgs/msg/CameraInfo', 'sensor_msgs/msg/Image')
     with Writer1(path) as bag:
-        info, image = (bag.add_connection(topic, kind, typestore=store)
-                       for topic, kind in zip(('/cam/camera_info', '/cam/image'), kinds, strict=True))
+        runs = [[bag.add_connection(topic, kind, typestore=store, callerid=driver)
+                 for topic, kind in zip(('/cam/camera_info', '/cam/image'), kinds, strict=True)]
+                for driver in ('/driver', '/driver_that_was_started_again')]
         for i, (stamp, depth) in enumerate(zip(STAMPS, depths, strict=True)):
+            info, image = runs[i > 7]
             header = types['std_msgs/msg/Header'](
                 seq=i, stamp=types['builtin_interfaces/msg/Time'](*divmod(stamp, 10**9)), frame_id='cam')
             k = np.array([CAMERA.fx, 0, CAMERA.cx, 0, CAMERA.fy, CAMERA.cy, 0, 0, 1])
@@ -162,6 +164,10 @@ def test_colour_images_are_not_taken_for_depth(shared_data):
 def test_a_bag_without_depth_is_refused(tmp_path, depths):
     with pytest.raises(InputError, match=r'colour\.bag: no topic carries depth'):
         DepthBag(write_ros1(tmp_path / 'colour.bag', depths, encoding='bgr8'))
+    with BagWriter(tmp_path / 'empty.mcap'):
+        pass
+    with pytest.raises(InputError, match=r'empty\.mcap: no topic carries depth, .* \(this one has no messages\)'):
+        DepthBag(tmp_path / 'empty.mcap')
 
 
 def test_a_transport_that_is_not_read_is_named(tmp_path):
@@ -177,8 +183,8 @@ def test_a_transport_that_is_not_read_is_named(tmp_path):
 
 def test_of_several_depth_topics_one_must_be_chosen(tmp_path, depths):
     with BagWriter(tmp_path / 'two.mcap') as bag:
-        for name in ('left', 'right'):
-            bag.write_depth(STAMPS[0], name, depths[name == 'right'], CAMERA, topic=f'/{name}/image', codec=None)
+        for name, camera in (('left', Intrinsics(600, 600, 31.5, 23.5, 64, 48)), ('right', CAMERA)):
+            bag.write_depth(STAMPS[0], name, depths[name == 'right'], camera, topic=f'/{name}/image', codec=None)
         bag._writer.add_connection('/never/image', 'sensor_msgs/msg/Image', typestore=typestore())
     with pytest.raises(InputError, match=r'carry depth: choose one with --depth-topic: /left/image, /right/image$'):
         DepthBag(tmp_path / 'two.mcap')
@@ -188,8 +194,12 @@ def test_of_several_depth_topics_one_must_be_chosen(tmp_path, depths):
     with DepthBag(tmp_path / 'two.mcap', depth_topic='/right/image') as bag:
         [frame] = bag
     np.testing.assert_array_equal(frame.depth, depths[1])
-    with pytest.raises(InputError, match=r'no sensor_msgs/Image or sensor_msgs/CompressedImage on /middle/image'):
-        DepthBag(tmp_path / 'two.mcap', depth_topic='/middle/image')
+    assert frame.intrinsics == CAMERA
+    with DepthBag(tmp_path / 'two.mcap', '/right/image', camera_info_topic='/left/camera_info') as bag:
+        assert next(iter(bag)).intrinsics.fx == 600
+    for topic in ('/middle/image', '/left/camera_info'):
+        with pytest.raises(InputError, match=f'no sensor_msgs/Image or sensor_msgs/CompressedImage on {topic}'):
+            DepthBag(tmp_path / 'two.mcap', depth_topic=topic)
 
 
 def test_a_crop_that_the_node_published_is_no_depth(tmp_path, depths):
@@ -247,15 +257,24 @@ def test_the_newest_camera_info_counts(tmp_path, depths):
 
 
 def test_each_image_has_the_camera_of_its_frame(tmp_path, depths):
+    frame_ids = ['left', 'right', 'unknown']
     with BagWriter(tmp_path / 'two.mcap') as bag:
-        write = bag.write_serialized  # all camera_infos come first
-        bag.write_serialized = lambda topic, kind, data, at, **more: write(
-            topic, kind, data, at - 10**9 * topic.endswith('info'), **more)
-        for i, frame_id in enumerate(('left', 'right')):
+        write = bag.write_serialized
+
+        def record(topic, kind, data, at, **more):
+            if not topic.endswith('info'):
+                write(topic, kind, data, at + 5, **more)
+            elif at != STAMPS[2]:  # the third frame has no camera_info
+                write(topic, kind, data, at - 10**9, **more)  # and the others come before all images
+
+        bag.write_serialized = record
+        for i, frame_id in enumerate(frame_ids):
             bag.write_depth(STAMPS[i], frame_id, depths[0], Intrinsics(300 + i, 300, 32, 24, 64, 48))
     with DepthBag(tmp_path / 'two.mcap', depth_scale=0.01) as bag:
         frames = list(bag)
-    assert [(frame.frame_id, frame.intrinsics.fx) for frame in frames] == [('left', 300), ('right', 301)]
+    assert [frame.frame_id for frame in frames] == frame_ids
+    assert [frame.intrinsics.fx for frame in frames] == [300, 301, 301], 'where there is no other, the newest counts'
+    assert [(frame.stamp_ns, frame.recorded_ns - 5) for frame in frames] == [(at, at) for at in STAMPS[:3]]
     np.testing.assert_allclose(frames[0].depth, 10 * depths[0], rtol=1e-6)
 
 

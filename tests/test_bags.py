@@ -16,7 +16,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
-from hand_pose_ros.bags import Bag, BagWriter, DepthBag, read_hands
+from hand_pose_ros.bags import Bag, BagWriter, DepthBag, check_frame, read_hands
 from hand_pose_ros.bags.bag import typestore
 from hand_pose_ros.errors import InputError
 from hand_pose_ros.geometry import Cube, Intrinsics
@@ -376,7 +376,8 @@ def test_hands_come_back_as_written(tmp_path):
     recorded = read_hands(tmp_path / 'hands.mcap')
     assert [record.stamp_ns for record in recorded] == STAMPS[:3]
     for record, present in zip(recorded, hands, strict=True):
-        assert record.joints.shape[0] == len(present) and record.skeleton == 'hand21'
+        assert record.joints.shape == (len(present), 21, 3) and record.confidence.shape == (len(present), 21)
+        assert record.frame_id == 'camera' and record.skeleton == 'hand21'
         assert record.sides == tuple(h.side for h in present) and record.ids == tuple(h.id for h in present)
         for i, h in enumerate(present):
             np.testing.assert_array_equal(record.joints[i], h.joints)
@@ -396,18 +397,51 @@ def test_hands_come_back_as_written(tmp_path):
 
 @pytest.mark.parametrize('skeleton', [HAND21, Skeleton('paw', ('toe',), (-1,))])
 def test_hands_without_all_their_joints_are_refused(tmp_path, skeleton):
-    whole, part = hand(1), hand(1)
+    whole, part, unsure = hand(1), hand(1), hand(1)
     part.joints, part.confidence = part.joints[:20], part.confidence[:20]
-    for name, hands in (('part', [part]), ('both', [whole, part])):
+    unsure.confidence = unsure.confidence[:20]
+    for name, hands in (('part', [part]), ('both', [whole, part]), ('unsure', [unsure])):
         with BagWriter(tmp_path / f'{name}.mcap') as bag:
             bag.write_hands(STAMPS[0], 'camera', hands, skeleton)
-    with pytest.raises(InputError, match=fr'joints and confidences, but all must have 21 \({skeleton.name}\)'):
-        read_hands(tmp_path / 'both.mcap')
+    for name in ('both', 'unsure'):
+        with pytest.raises(InputError, match=fr'joints and confidences, but all must have 21 \({skeleton.name}\)'):
+            read_hands(tmp_path / f'{name}.mcap')
     if skeleton == HAND21:
         with pytest.raises(InputError, match=r'part.mcap: /hand/joints: .* have \[20\] joints'):
             read_hands(tmp_path / 'part.mcap')
     else:  # how many an unknown one has is not known
-        assert read_hands(tmp_path / 'part.mcap')[0].joints.shape == (1, 20, 3)
+        [record] = read_hands(tmp_path / 'part.mcap')
+        assert record.skeleton == 'paw' and record.joints.shape == (1, 20, 3)
+
+
+def test_of_several_topics_of_hands_one_must_be_chosen(tmp_path):
+    with BagWriter(tmp_path / 'two.mcap') as bag:
+        for i, topic in enumerate(('/right', '/left')):
+            bag.write_hands(STAMPS[i], 'camera', [hand(i)], topic=topic)
+    with pytest.raises(InputError, match=r'several topics carry .*HandJointsArray: choose one of /left, /right$'):
+        read_hands(tmp_path / 'two.mcap')
+    assert [record.ids for record in read_hands(tmp_path / 'two.mcap', '/left')] == [('hand_1',)]
+
+
+def test_hands_before_damage_are_read_where_part_of_them_is_enough(tmp_path):
+    with BagWriter(tmp_path / 'whole.mcap') as bag:
+        for stamp in range(4000):  # more than one chunk
+            bag.write_hands(stamp, 'camera', [hand(1)] if stamp % 500 == 0 else [])
+            bag.write('/noise', 'std_msgs/msg/String', typestore().types['std_msgs/msg/String']('x' * 500), stamp)
+    data = (tmp_path / 'whole.mcap').read_bytes()
+    (tmp_path / 'cut.mcap').write_bytes(data[:len(data) * 3 // 4])
+    with pytest.raises(InputError, match=r'cut\.mcap: the bag was cut short'):
+        read_hands(tmp_path / 'cut.mcap')
+    stamps = [record.stamp_ns for record in read_hands(tmp_path / 'cut.mcap', partly=True)]
+    assert 0 < len(stamps) < 4000 and stamps == list(range(len(stamps)))
+
+
+def test_hands_and_images_of_other_frames_do_not_belong_together():
+    check_frame('bag', 'camera', 'camera')
+    check_frame('bag', '', 'camera')  # who gives no name may mean any
+    check_frame('bag', 'camera', '')
+    with pytest.raises(InputError, match=r"^bag: .* joints are in frame 'world', but the images in 'camera'"):
+        check_frame('bag', 'world', 'camera')
 
 
 def test_markers_come_back_as_written(tmp_path):

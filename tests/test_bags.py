@@ -91,13 +91,15 @@ def test_depth_and_camera_come_back_as_written(tmp_path, depths, name, codec):
     assert frames[0].topic == f'/{BASE}' + ('/compressedDepth' if codec else '')
 
 
-def test_camera_info_is_that_of_a_rectified_image(tmp_path, depths):
+def test_messages_are_those_of_a_rectified_depth_image(tmp_path, depths):
     with Bag(write(tmp_path / 'bag.mcap', depths)) as bag:
-        [connection] = [one for one in bag.connections if one.topic.endswith('camera_info')]
-        info = bag.first(connection)
+        messages = {connection.topic: bag.first(connection) for connection in bag.connections}
+    assert messages[f'/{BASE}'].encoding == '16UC1', 'what depth_image_proc takes'
+    info = messages['/depth/camera_info']
     k = [300.5, 0, 31.5, 0, 301.5, 23.5, 0, 0, 1]
     assert info.k.tolist() == k and info.p.tolist() == np.insert(k, [3, 6, 9], 0).tolist(), 'depth_image_proc reads p'
-    assert info.r.tolist() == np.eye(3).ravel().tolist() and not info.d.any()
+    assert info.r.tolist() == np.eye(3).ravel().tolist()
+    assert info.distortion_model == 'plumb_bob' and not info.d.any()
 
 
 def test_images_come_back_as_written_in_whatever_order_they_lie_in_memory(tmp_path, depths):
@@ -125,6 +127,12 @@ def test_a_damaged_sqlite3_bag_is_told_by_its_name(tmp_path):
     (tmp_path / 'a b%.db3').write_bytes(b'no database')
     with pytest.raises(InputError, match=r'^[^%]*/a b%\.db3: the bag cannot be opened'):
         Bag(tmp_path / 'a b%.db3')
+
+
+def test_sqlite3_folder(tmp_path, depths):
+    path = write(tmp_path / 'new' / 'place' / 'folder', depths, storage='sqlite3')
+    assert list(path.glob('*.db3')) and (path / 'metadata.yaml').is_file()
+    assert_same(path, depths)
 
 
 @pytest.mark.parametrize('camera_first', [True, False])
@@ -452,38 +460,47 @@ def test_markers_come_back_as_written(tmp_path):
         shown = bag.first(bag.connections[0]).markers
     for message, marker in zip(shown, markers, strict=True):
         assert (message.ns, message.type, message.action) == (marker.namespace, marker.type, marker.action)
-        assert message.header.frame_id == 'camera' and message.pose.orientation.w == 1 and not message.frame_locked
+        assert (message.header.frame_id, message.header.stamp.nanosec) == ('camera', 1)
+        assert (message.lifetime.sec, message.lifetime.nanosec) == (0, 0), 'it is shown until it is deleted'
+        assert message.pose.orientation.w == 1 and not message.frame_locked
         assert (message.scale.x, message.scale.y, message.scale.z) == tuple(marker.scale)
         assert [(p.x, p.y, p.z) for p in message.points] == [tuple(map(float, point)) for point in marker.points]
         colors = [(c.r, c.g, c.b, c.a) for c in message.colors]
         np.testing.assert_allclose(colors, list(marker.colors), rtol=1e-6)
 
 
-def test_hands_may_be_recorded_later_than_their_image(tmp_path):
+@pytest.mark.parametrize('recorded', [9, 0])  # clocks of simulators begin at 0
+def test_hands_are_recorded_at_any_time(tmp_path, recorded):
     with BagWriter(tmp_path / 'hands.mcap') as bag:
-        bag.write_skeleton(1, 'camera', HAND21, 'a network', '1.2', recorded_ns=9)
-        bag.write_hands(1, 'camera', [hand(1)], recorded_ns=9)
-        bag.write_markers(1, 'camera', [], recorded_ns=9)
+        bag.write_skeleton(1, 'camera', HAND21, 'a network', '1.2', recorded_ns=recorded)
+        bag.write_hands(1, 'camera', [hand(1)], recorded_ns=recorded)
+        bag.write_markers(1, 'camera', [], recorded_ns=recorded)
     with Bag(tmp_path / 'hands.mcap') as bag:
-        assert [at for _, at, _ in bag.messages(bag.connections)] == [9, 9, 9]
+        assert [at for _, at, _ in bag.messages(bag.connections)] == [recorded] * 3
     assert read_hands(tmp_path / 'hands.mcap')[0].stamp_ns == 1
 
 
 def test_the_skeleton_is_recorded_latched(tmp_path):
+    paw = Skeleton('paw', ('palm', 'toe'), (-1, 0))
     with BagWriter(tmp_path / 'hands.mcap') as bag:
-        bag.write_skeleton(STAMPS[0], 'camera', HAND21, 'a network', '1.2')
+        bag.write_skeleton(STAMPS[0], 'camera', paw, 'a network', '1.2')
+        bag.write_hands(STAMPS[0], 'camera', [], paw)
     with Bag(tmp_path / 'hands.mcap') as bag:
-        [connection] = bag.connections
-        [qos] = connection.ext.offered_qos_profiles
-        assert (qos.durability.name, qos.depth) == ('TRANSIENT_LOCAL', 1)
-        message = bag.first(connection)
-    assert tuple(message.joint_names) == HAND21.joint_names and tuple(message.parents) == HAND21.parents
-    assert (message.name, message.model, message.model_version) == ('hand21', 'a network', '1.2')
+        offered = {connection.topic: connection.ext.offered_qos_profiles for connection in bag.connections}
+        message = bag.first(next(one for one in bag.connections if one.topic == '/hand/skeleton'))
+    for topic, wanted in (('/hand/skeleton', ('TRANSIENT_LOCAL', 1)), ('/hand/joints', ('VOLATILE', 10))):
+        [qos] = offered[topic]
+        assert (qos.durability.name, qos.depth) == wanted
+        assert qos.reliability.name == 'RELIABLE', 'else who wants that gets nothing from a player'
+    assert tuple(message.joint_names) == paw.joint_names and tuple(message.parents) == paw.parents
+    assert (message.name, message.model, message.model_version) == ('paw', 'a network', '1.2')
 
 
 def test_a_bag_behind_a_link_is_written_where_that_leads(tmp_path, depths):
     (tmp_path / 'disk').mkdir()
     (tmp_path / 'bag.mcap').symlink_to(tmp_path / 'disk' / 'other.mcap')
+    with BagWriter(tmp_path / 'bag.mcap'):
+        assert list((tmp_path / 'disk').iterdir()), 'what is written elsewhere cannot be moved to another disk'
     assert_same(write(tmp_path / 'bag.mcap', depths), depths)
     assert (tmp_path / 'bag.mcap').is_symlink() and (tmp_path / 'disk' / 'other.mcap').is_file()
 
@@ -499,6 +516,11 @@ def test_a_folder_where_a_bag_of_one_file_is_to_be_is_refused_at_once(tmp_path):
     (tmp_path / 'bag.mcap').mkdir()
     with pytest.raises(InputError, match='there is something already'), BagWriter(tmp_path / 'bag.mcap'):
         pytest.fail('after minutes of work it would be too late')
+    (tmp_path / 'file').touch()
+    with pytest.raises(InputError, match='there is something already'), BagWriter(tmp_path / 'file'):
+        pytest.fail('a bag of many files does not fit into one')
+    with pytest.raises(InputError, match=r'file/new\.mcap: the bag cannot be written \(.*\): choose another place'):
+        BagWriter(tmp_path / 'file' / 'new.mcap')
     with pytest.raises(InputError, match=r'give a \.bag, \.mcap or \.db3 file'):
         Bag(tmp_path / 'bag.mcap')
 
@@ -583,14 +605,16 @@ def test_messages_that_are_compressed_one_by_one_need_their_folder(tmp_path, sto
         list(bag)
 
 
+@pytest.mark.parametrize('when', ['write', 'close'])
 @pytest.mark.parametrize('name', ['x.mcap', 'x.db3', 'folder'])
-def test_a_full_disk_is_told_of_with_the_bag(tmp_path, monkeypatch, name):
+def test_a_full_disk_is_told_of_with_the_bag(tmp_path, monkeypatch, name, when):
     def full(*_):
         raise OSError(28, 'No space left on device') if name != 'x.db3' else sqlite3.OperationalError(
             'database or disk is full')
 
     bag = BagWriter(tmp_path / name)
-    monkeypatch.setattr(bag._writer, 'write', full)
+    for attempt in (when, 'abort'):  # which flushes a buffer
+        monkeypatch.setattr(bag._writer, attempt, full)
     with pytest.raises(InputError, match=f'{name}: cannot be written, for the disk is full'), bag:
         bag.write_depth(1, 'camera', np.ones((120, 160), np.float32), Intrinsics(150, 150, 80, 60, 160, 120))
     assert not list(tmp_path.iterdir())

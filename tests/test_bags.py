@@ -302,6 +302,35 @@ def test_a_damaged_image_spoils_only_itself(tmp_path, depths):
     np.testing.assert_array_equal(frames[2].depth, depths[2])
 
 
+@pytest.mark.parametrize('partly', [False, True])
+def test_a_message_that_is_damaged_is_named(tmp_path, partly):
+    with BagWriter(tmp_path / 'bag.mcap') as bag:
+        bag.write_serialized('/hand/joints', 'hand_pose_ros/msg/HandJointsArray', b'\0\1\0\0\1', 1)
+    with pytest.raises(InputError, match=r'bag\.mcap: a message on /hand/joints is damaged .*: record or copy'):
+        read_hands(tmp_path / 'bag.mcap', partly=partly)
+
+
+def test_a_bag_may_be_read_from_a_time_on(tmp_path, depths):
+    with Bag(write(tmp_path / 'bag.mcap', depths)) as bag:
+        assert bag.start_ns == STAMPS[0]
+        times = [at for _, at, _ in bag.messages(bag.connections, start=STAMPS[5])]
+    assert times == sorted(2 * STAMPS[5:])
+
+
+def test_a_bag_that_is_damaged_in_the_middle_says_how_far_it_could_be_read(tmp_path):
+    noise = np.random.default_rng(0).integers(1, 4000, (240, 320), np.uint16) * np.float32(0.001)
+    with BagWriter(tmp_path / 'bag.db3') as bag:
+        for i in range(6):
+            bag.write_depth(STAMPS[0] + i, 'camera', noise, Intrinsics(300, 300, 160, 120, 320, 240), codec=None)
+    with open(tmp_path / 'bag.db3', 'r+b') as file:
+        file.seek(file.seek(0, os.SEEK_END) // 2 // 4096 * 4096)
+        file.write(b'\xff' * 8192)
+    frames, said = read_until_damage(tmp_path / 'bag.db3')
+    assert 0 < len(frames) < 6
+    assert f'bag.db3: the bag is damaged after {2 * len(frames) + 1} messages (' in said
+    assert f'({len(frames)} of 6 depth images were read)' in said
+
+
 def read_until_damage(path):
     """Depth images before the error, and its message."""
     frames = []
@@ -350,6 +379,14 @@ def test_a_folder_without_metadata_is_read(tmp_path, depths):
     (tmp_path / 'damaged' / 'a_0.db3').write_text('x')
     with pytest.raises(InputError, match=r'a_0\.db3: .* database .* `sqlite3 .*/a_0\.db3 \.recover'):
         DepthBag(tmp_path / 'damaged')
+    (path / 'folder_1.mcap').unlink()
+    data = (path / 'folder.mcap').read_bytes()
+    (path / 'folder.mcap').write_bytes(data[:data.rindex(struct.pack('<BQ', 0x0f, 4))])
+    frames, said = read_until_damage(path)
+    assert len(frames) == len(depths) and 'folder: the bag was cut short' in said
+    path = write(tmp_path / 'run#1', depths, storage='sqlite3')
+    (path / 'metadata.yaml').unlink()
+    assert_same(path, depths)
 
 
 @pytest.mark.parametrize(('name', 'remedy'), [
@@ -535,23 +572,36 @@ def test_metadata_that_is_damaged_is_told_in_one_line(tmp_path, depths, metadata
     assert '\n' not in str(caught.value)
 
 
-def test_camera_infos_that_are_counted_but_lost_are_told(tmp_path, depths):
+def test_messages_that_are_counted_but_lost_are_told(tmp_path, depths):
     path = write(tmp_path / 'bag', depths, storage='sqlite3')
     with sqlite3.connect(path / 'bag.db3') as database:
         database.execute("DELETE FROM messages WHERE topic_id = (SELECT id FROM topics WHERE name LIKE '%camera_info')")
     with pytest.raises(InputError, match='bag: the bag counts messages of camera_info that are not there'), \
             DepthBag(path) as bag:
         next(iter(bag))
+    with sqlite3.connect(path / 'bag.db3') as database:
+        database.execute('DELETE FROM messages')
+    with pytest.raises(InputError, match=f'bag: the bag counts messages on /{BASE} that are not there'):
+        DepthBag(path)
+
+
+def test_hands_are_read_where_the_bag_does_not_define_them(tmp_path):
+    """As ROS 2 Humble records them with sqlite3."""
+    with BagWriter(tmp_path / 'bag.db3') as bag:
+        bag.write_hands(1, 'camera', [hand(1)])
+    with sqlite3.connect(tmp_path / 'bag.db3') as database:
+        assert database.execute('DELETE FROM message_definitions').rowcount
+    assert read_hands(tmp_path / 'bag.db3')[0].ids == ('hand_1',)
 
 
 def test_a_bag_that_was_closed_is_not_called_damaged(tmp_path, depths):
     with DepthBag(write(tmp_path / 'bag.mcap', depths)) as bag:
         frames = iter(bag)
         next(frames)
-        bag.close()
     for read in (lambda: next(frames), lambda: list(bag), lambda: bag.first(bag.connections[0])):
         with pytest.raises(InputError, match=r'bag\.mcap: the bag was closed'):
             read()
+    bag.close()  # once more does no harm
 
 
 def test_a_bag_may_be_closed_or_given_up_before_its_block_ends(tmp_path):

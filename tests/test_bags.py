@@ -365,6 +365,15 @@ def test_an_interrupted_mcap_may_end_anywhere(tmp_path, depths):
         (tmp_path / 'cut.mcap').write_bytes(rest)
         frames, said = read_until_damage(tmp_path / 'cut.mcap')
         assert len(frames) == len(depths) and 'cut.mcap: the bag was cut short' in said
+    at = 8
+    while data[at] != 0x06:  # the only chunk
+        at += 9 + struct.unpack_from('<Q', data, at + 1)[0]
+    at += 9 + struct.unpack_from('<Q', data, at + 1)[0]
+    (tmp_path / 'cut.mcap').write_bytes(data[:at])
+    assert len(read_until_damage(tmp_path / 'cut.mcap')[0]) == len(depths)
+    (tmp_path / 'cut.mcap').write_bytes(data[:at - 1])
+    with pytest.raises(InputError, match='cut short before its first chunk was complete'):
+        DepthBag(tmp_path / 'cut.mcap')
 
 
 def test_a_folder_without_metadata_is_read(tmp_path, depths):
@@ -408,8 +417,9 @@ def test_what_is_no_bag_is_refused(tmp_path):
     (tmp_path / 'text.mcap').write_text('hello')
     for name, reason in (('missing.mcap', 'no such bag'), ('notes.txt', 'give a .bag'), ('empty.mcap', 'it is empty'),
                          ('text.mcap', 'it is no MCAP file'), ('.', 'give a .bag')):
-        with pytest.raises(InputError, match=reason):
+        with pytest.raises(InputError, match=reason) as error:
             Bag(tmp_path / name)
+        assert ('ros2 bag reindex' in str(error.value)) == (name == '.'), 'that is for folders'
 
 
 def test_hands_come_back_as_written(tmp_path):

@@ -227,6 +227,12 @@ def test_depth_that_is_only_compressed_is_found(rig: Rig, monkeypatch: pytest.Mo
     rig.client.create_publisher(CompressedImage, f'depth/image_rect/{transport}', RELIABLE)
     rig.until_said(f'depth is published on /depth/image_rect/{transport}: set the parameter transport to {transport}')
 
+
+def test_why_no_image_arrives_is_told_also_where_camera_info_does(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(node_module, 'SILENCE_S', 0.1)
+    rig.start()
+    rig.client.create_publisher(CompressedImage, 'depth/image_rect/compressed', RELIABLE)
+
     def newest_message(infos: rclpy.publisher.Publisher, reports: int = 3) -> str:
         """Of the diagnostics, after some seconds of camera_info alone."""
         end = len(rig.received[DiagnosticArray]) + reports
@@ -237,7 +243,7 @@ def test_depth_that_is_only_compressed_is_found(rig: Rig, monkeypatch: pytest.Mo
 
     infos = rig.client.create_publisher(CameraInfo, 'depth/camera_info', RELIABLE)
     rig.connected(infos)
-    assert f'set the parameter transport to {transport}' in newest_message(infos)
+    assert 'set the parameter transport to compressed' in newest_message(infos)
     assert not any('camera_info but only' in text for text in rig.said())
     rig.connected(rig.client.create_publisher(Image, 'depth/image_rect', RELIABLE))
     assert 'if it does publish, start the camera driver with' in newest_message(infos)

@@ -15,6 +15,8 @@ from hand_pose_ros.models.refiner import Refiner
 from hand_pose_ros.models.two_looks import View
 from hand_pose_ros.skeleton import HAND21, SKELETONS
 
+pytestmark = pytest.mark.usefixtures('one_thread')
+
 POSE_NETWORKS = ('shallow', 'deep', 'deep_prior', 'multi_scale', 'resnet', 'hand_dense')
 REFINERS = ('std_ref', 'or_ref')
 
@@ -22,7 +24,6 @@ REFINERS = ('std_ref', 'or_ref')
 @pytest.fixture(autouse=True)
 def _seed() -> None:
     torch.manual_seed(0)
-    torch.set_num_threads(1)
 
 
 def parameters(network: nn.Module) -> int:

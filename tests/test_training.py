@@ -35,6 +35,8 @@ from hand_pose_ros.training.state import load_progress, save_tensors
 from hand_pose_ros.training.stream import SampleStream
 from hand_pose_ros.training.validation import some_samples
 
+pytestmark = pytest.mark.usefixtures('one_thread')
+
 TINY = ('dataset=icvl', 'network=shallow', 'options.bottleneck=8', 'batch_size=4', 'shard_size=4', 'val_every=40',
         'samples=96')
 
@@ -62,14 +64,6 @@ def folder(tmp_path_factory) -> Path:
     for file, part in (('labels', slice(20)), ('test_seq_1', slice(20, 23)), ('test_seq_2', slice(23, 26))):
         (root / f'{file}.txt').write_text('\n'.join(lines[part]))
     return root
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def tiny(folder: Path, *overrides: str, recipe: str = 'paper', out: Path, **machine) -> Run:
@@ -474,6 +468,7 @@ def test_a_batch_that_cannot_be_shared_is_refused(folder, tmp_path, monkeypatch)
 def test_epochs_are_of_the_samples_and_threads_as_many_as_asked(folder, tmp_path):
     run = tiny(folder, 'samples=none', 'epochs=3', out=tmp_path, threads=2)
     assert run.budget == 3 * 16 and torch.get_num_threads() == 2
+    torch.set_num_threads(1)
 
 
 def test_a_device_that_is_not_there_is_told_before_the_work(folder, tmp_path):

@@ -11,7 +11,6 @@ import torch
 from hand_pose_ros.bags import BagWriter
 from hand_pose_ros.cli import adapt as verb
 from hand_pose_ros.cli import main
-from hand_pose_ros.datasets import joints_in_metres
 from hand_pose_ros.estimator import HandEstimate, HandPoseEstimator
 from hand_pose_ros.evaluation.metrics import bone_drift_mm
 from hand_pose_ros.evaluation.results import Result
@@ -19,7 +18,6 @@ from hand_pose_ros.geometry import Cube, Intrinsics
 from hand_pose_ros.models import build
 from hand_pose_ros.models.checkpoints import WEIGHTS, load_checkpoint, save_checkpoint
 from hand_pose_ros.skeleton import HAND21
-from hand_pose_ros.synthetic.crops import to_cube
 from hand_pose_ros.synthetic.generator import SyntheticHands
 from hand_pose_ros.synthetic.hand import HandModel
 from hand_pose_ros.synthetic.kinematics import INDEX
@@ -175,12 +173,6 @@ def test_answers_that_do_not_follow_the_crop_disagree():
     crops, _ = plates()
     _, spread = consensus(lambda patches: np.tile(np.float32([[0.5, 0, 0]]), (len(patches), 3, 1)), crops, at_once)
     assert spread.min() > 0.03
-
-
-def test_cube_units_and_back():
-    points = torch.randn(4, 21, 3, generator=torch.Generator().manual_seed(0)) * 0.05 + torch.tensor([0.1, 0, 0.5])
-    cube = points.mean(1), torch.tensor([0.25, 0.3, 0.3, 0.35])
-    assert torch.allclose(joints_in_metres(to_cube(points, *cube), *cube), points, atol=1e-6)
 
 
 @pytest.fixture(scope='module')

@@ -136,7 +136,7 @@ def test_sqlite3_folder(tmp_path, depths):
 
 
 @pytest.mark.parametrize('camera_first', [True, False])
-def test_ros1(tmp_path, depths, camera_first):
+def test_ros1_bags_come_back_frame_by_frame(tmp_path, depths, camera_first):
     """Also where the first image was recorded before its camera_info."""
     frames = assert_same(write_ros1(tmp_path / 'old.bag', depths, camera_first), depths)
     assert frames[0].frame_id == 'cam'

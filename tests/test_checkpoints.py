@@ -95,7 +95,7 @@ def test_an_interrupted_save_leaves_the_old_file(file, monkeypatch):
     assert list(file.parent.iterdir()) == [file]
 
 
-def test_names_and_paths(file, monkeypatch):
+def test_checkpoints_are_found_by_name_and_by_path(file, monkeypatch):
     monkeypatch.setattr(checkpoints, 'WEIGHTS', file.parent)
     assert available() == {'small': file}
     assert load_checkpoint('small').metadata['note'] == 'made by a test'

@@ -68,7 +68,7 @@ def write_nyu_png(path: Path, millimetres: np.ndarray) -> None:
     cv2.imwrite(str(path), image)
 
 
-def test_nyu(tmp_path, monkeypatch):
+def test_nyu_is_read_as_it_is_distributed(tmp_path, monkeypatch):
     monkeypatch.setattr(nyu_module, 'FIRST_SUBJECT', 2)
     rng = np.random.default_rng(1)
     train, test = write_nyu(tmp_path, 'train', 6, rng), write_nyu(tmp_path, 'test', 3, rng)
@@ -136,7 +136,7 @@ def write_icvl(root: Path, rng: np.random.Generator, labels: str = 'labels.txt')
 
 
 @pytest.mark.parametrize('labels', ['labels.txt', 'train.txt'])
-def test_icvl(tmp_path, labels):
+def test_icvl_is_read_as_it_is_distributed(tmp_path, labels):
     write_icvl(tmp_path, np.random.default_rng(2), labels)
     sizes = {split: open_dataset('icvl', split, tmp_path).size for split in SPLITS}
     assert sizes == {'train': 2, 'val': 1, 'test': 3, 'test_1': 2, 'test_2': 1}  # rotated copies are left out
@@ -233,7 +233,7 @@ def test_hands_of_one_image_have_sides_of_their_own_and_must_be_told_in_its_fram
         open_dataset('bags', 'test', tmp_path).frame(0)
 
 
-def test_bags(tmp_path, caplog):
+def test_labelled_images_of_bags_are_samples_and_left_hands_are_mirrored_in(tmp_path, caplog):
     rng, camera = np.random.default_rng(4), BAG_CAMERA
     hands = []
     (tmp_path / 'train' / 'notes').mkdir(parents=True)  # is no bag

@@ -268,7 +268,7 @@ def test_what_does_not_fit_into_sixteen_bits_is_no_reading():
     assert to_units(depth).tolist() == [[0, 0, 1, 65535, 0, 0, 0]]
 
 
-def test_png_files(tmp_path, units):
+def test_pngs_are_read_in_metres_or_refused_by_name(tmp_path, units):
     path = tmp_path / 'depth.png'
     cv2.imwrite(str(path), units)
     np.testing.assert_allclose(read_png(path, 0.002), units * 0.002, rtol=1e-6)
@@ -284,7 +284,7 @@ def test_png_files(tmp_path, units):
         read_png(tmp_path)
 
 
-def test_real_frames(shared_data):
+def test_real_frames_are_read_in_metres(shared_data):
     kinect = read_png(shared_data / 'frames/kinect2/00000010.png')
     assert kinect.shape == (424, 512) and 0.5 < kinect[kinect > 0].min() < 0.7
     sr305 = read_png(shared_data / 'frames/sr305/20210326-230536/30.png', 0.000125)

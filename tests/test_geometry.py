@@ -113,14 +113,14 @@ def test_a_patch_shows_a_joint_where_cube_units_say():
     assert columns.mean() == pytest.approx(column, abs=1) and rows.mean() == pytest.approx(row, abs=1)
 
 
-def test_raw_and_rectified_intrinsics():
+def test_rectified_images_take_p_and_raw_ones_k():
     p = [400.0, 0, 310, 0, 0, 410, 230, 0, 0, 0, 1, 0]
     assert Intrinsics.from_camera_info(camera_info(p=p)) == Intrinsics(400, 410, 310, 230, 640, 480)
     assert Intrinsics.from_camera_info(camera_info(p=p), rectified=False) == Intrinsics(500, 510, 320, 240, 640, 480)
     assert Intrinsics.from_camera_info(camera_info()) == Intrinsics(500, 510, 320, 240, 640, 480)  # P not filled in
 
 
-def test_binning_and_region_of_interest():
+def test_intrinsics_follow_binning_and_region_of_interest():
     roi = SimpleNamespace(x_offset=100, y_offset=40, width=400, height=200)
     assert (Intrinsics.from_camera_info(camera_info(roi=roi, binning_x=2, binning_y=4))
             == Intrinsics(250, 127.5, 110, 50, 200, 50))

@@ -251,7 +251,7 @@ def test_a_late_joiner_still_learns_the_skeleton(rig: Rig) -> None:
     assert tuple(skeleton.parents) == HAND21.parents
 
 
-def test_compressed_depth(rig: Rig) -> None:
+def test_compressed_depth_is_answered_and_damage_is_named(rig: Rig) -> None:
     rig.start(transport='compressedDepth')
     publish = rig.camera(kind=CompressedImage, topic='depth/image_rect/compressedDepth', info=camera_info())
     for codec in ('png', 'rvl'):

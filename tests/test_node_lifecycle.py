@@ -31,7 +31,7 @@ pytestmark = pytest.mark.usefixtures('ros_domain', 'load_once')
 COMMAND = [sys.executable, '-m', 'hand_pose_ros.cli']
 
 
-def test_lifecycle(rig: Rig) -> None:
+def test_each_state_has_what_it_needs_and_no_more(rig: Rig) -> None:
     node = rig.start(autostart=False)
     assert rig.state() == 'unconfigured'
     assert rig.client.count_publishers('/hand/joints') == 0
@@ -74,7 +74,7 @@ def test_unknown_weights_are_named_and_can_be_corrected(rig: Rig) -> None:
     rig.until(lambda: reports[-1].status[0].level == b'\x00', 'the error to be gone')
 
 
-def test_enable_and_reset(rig: Rig) -> None:
+def test_a_disabled_node_shows_nothing_and_reset_forgets_hands(rig: Rig) -> None:
     rig.start()
     publish = rig.camera(info=camera_info())
     first = rig.answer(publish, image(depth_with_hand(), 1)).hands[0].id

@@ -13,7 +13,7 @@ from hand_pose_ros.training.optimizers import learning_rate, make_optimizer, ort
 from hand_pose_ros.training.recipes import RECIPES, get_recipe
 
 
-def test_schedules():
+def test_learning_rates_follow_their_schedules():
     original, modern = RECIPES['original-code'], RECIPES['modern']
     assert learning_rate(original, 0) == pytest.approx(0.01 / 1.2)
     assert learning_rate(original, 0.999) == pytest.approx(0.01 / (1 + 0.2 * 100))

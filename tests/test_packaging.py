@@ -88,7 +88,7 @@ def test_bags_of_joints_can_be_read_without_ros() -> None:
     assert read.hands[0].confidence.tolist() == [0.25, 1.0]
 
 
-def test_resources() -> None:
+def test_resources_are_found_or_named() -> None:
     assert ElementTree.parse(resource('config/fastdds_large_images.xml')) is not None
     assert share_folder() == CHECKOUT
     with pytest.raises(HandPoseError, match=r'no_such\.yaml does not exist'):

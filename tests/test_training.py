@@ -512,7 +512,7 @@ def test_a_cuda_graph_trains_as_its_kernels_do(folder, tmp_path, network, monkey
     assert (graph - kernels).norm() < 0.1 * (kernels - start).norm()
 
 
-def test_command_line(tmp_path, folder, capsys):
+def test_arguments_of_train_that_cannot_be_are_refused(tmp_path, folder, capsys):
     assert main(['train', 'papers', '--out', str(tmp_path)]) == 1
     assert "unknown recipe 'papers'" in capsys.readouterr().err
     assert main(['train', '--resume', '--out', str(tmp_path)]) == 1

@@ -34,7 +34,7 @@ def recorded(path, entity, column):
     return dict(sorted(rows.items()))
 
 
-def test_a_bag(tmp_path, bag, depths, weights):
+def test_images_camera_and_hands_of_a_bag_are_where_they_belong(tmp_path, bag, depths, weights):
     out = tmp_path / 'made' / 'view.rrd'
     assert main(['view', str(bag), '--save', str(out), *with_(weights), '--side', 'left']) == 0
     assert [path.name for path in out.parent.iterdir()] == ['view.rrd']
@@ -105,7 +105,7 @@ def test_options_that_say_nothing_are_refused(bag, capsys):
         assert message in capsys.readouterr().err
 
 
-def test_live(tmp_path, weights, ros_domain):
+def test_live_topics_are_saved_as_they_were_published(tmp_path, weights, ros_domain):
     pytest.importorskip('rclpy', reason='needs ROS 2')
     pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
     from test_node import Rig, camera_info, depth_with_hand, image

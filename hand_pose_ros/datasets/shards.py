@@ -25,7 +25,7 @@ from safetensors.torch import save_file
 from hand_pose_ros.datasets.base import Batch, Dataset, DatasetError
 from hand_pose_ros.datasets.memory import keep_freed_memory
 from hand_pose_ros.files import in_one_step
-from hand_pose_ros.processes import leave_with_parent
+from hand_pose_ros.processes import blocked, leave_with_parent
 
 log = logging.getLogger(__name__)
 
@@ -104,12 +104,8 @@ class DiskShards:
                     log.info('making samples of %s, which may take minutes; they are kept in %s',
                              self.dataset.name, self._folder)
                     self._pool = self._start_pool()
-                # A worker that this starts inherits what is blocked, as only the training run decides when to stop.
-                blocked = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
-                try:
+                with blocked(signal.SIGINT, signal.SIGTERM):
                     self._making[shard] = self._pool.submit(_make_file, shard, self.path(shard))
-                finally:
-                    signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
 
     def read(self, shard: int) -> Batch:
         """The shard, as soon as it is there.

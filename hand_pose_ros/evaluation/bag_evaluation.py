@@ -30,7 +30,7 @@ from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.hand import HandEstimate
 from hand_pose_ros.models.checkpoints import DEFAULT
-from hand_pose_ros.processes import leave_with_parent
+from hand_pose_ros.processes import blocked, leave_with_parent
 from hand_pose_ros.runtime import check_device, cores
 from hand_pose_ros.skeleton import Skeleton
 
@@ -255,12 +255,8 @@ def _attempts(paths: Sequence[str | Path], settings: Settings, sinks: Mapping[st
         return
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context('spawn'), _start_worker)
     try:
-        # A worker inherits what is blocked: Ctrl-C, which reaches all processes, is for this one to pass on.
-        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT,))
-        try:
+        with blocked(signal.SIGINT):  # Ctrl-C reaches all processes
             futures = {pool.submit(_work, path, settings, sinks.get(path)): path for path in paths}
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
         for future in as_completed(futures):
             path = futures[future]
             try:

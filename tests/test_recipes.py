@@ -27,7 +27,7 @@ def test_any_value_of_a_recipe_can_be_replaced():
     ('options=8', 'set each value on its own, for example options.bottleneck=8$'),
     ('samples=-5', '--set samples=-5: must be at least 1'), ('batch_size=0', 'at least 1'), ('seed=-1', 'at least 0'),
     ('seed=20261126', 'at most 4194303'), ('learning_rate=-1', r'learning_rate=-1: must be at least 1e-09'),
-    ('learning_rate=1e999', r'1e999: must be at most 1000000000000$'), ('knee=1e999', 'at most 1000000000000'),
+    ('learning_rate=1e999', r'1e999: must be at most 1e\+30$'), ('knee=1e999', r'at most 1e\+30'),
     ('knee=0', 'at least 1e-06'), ('weight_decay=-1', 'at least 0'), ('warmup=2', 'at most 1'),
     ('augmentation.scale=0', r'--set augmentation\.scale=0: must be at least 1'),
     ('augmentation.dropout=2', 'at most 1'), ('augmentation.jitter=8', r'at most 0\.1'),

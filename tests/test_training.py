@@ -485,7 +485,7 @@ def test_a_process_of_torchrun_without_a_gpu_says_so(folder, tmp_path, device, m
 
 
 def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_batch(folder, tmp_path):
-    run = tiny(folder, 'learning_rate=1e12', out=tmp_path)
+    run = tiny(folder, 'learning_rate=1e30', out=tmp_path)
     with pytest.raises(TrainingError, match=r'step \d+ is not finite .* learning_rate below 1e\+30'):
         run.train()
     assert not list(tmp_path.glob('state*')) and not list(tmp_path.glob('last*'))  # spoilt

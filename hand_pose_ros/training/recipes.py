@@ -97,7 +97,7 @@ EPOCH_OF_ENDLESS_DATA = 72_757
 _CHOICES = {'loss': ('huber', 'smooth_l1', 'squared'), 'optimizer': ('sgd', 'rmsprop', 'adamw', 'muon'),
             'schedule': ('constant', 'hyperbolic', 'cosine'), 'precision': ('float32', 'bfloat16')}
 
-_MOST = 10**12
+_MOST = 1e30
 """More than any number of a recipe needs, and less than infinity."""
 _RANGES: dict[str, tuple[float, float]] = {
     'knee': (1e-6, _MOST), 'learning_rate': (1e-9, _MOST), 'seed': (0, MAX_SEED - 1), 'rotation_deg': (0, 180),

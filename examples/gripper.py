@@ -22,7 +22,7 @@ from hand_pose_ros.angles import ANGLES, finger_angles
 from hand_pose_ros.errors import HandPoseError, InputError
 from hand_pose_ros.hand import side_of
 from hand_pose_ros.msg import HandJointsArray
-from hand_pose_ros.ros import init
+from hand_pose_ros.ros import init, shutdown
 from hand_pose_ros.skeleton import HAND21
 
 PIP = [ANGLES.index(f'{finger}_pip_flexion') for finger in ('index', 'middle', 'ring', 'pinky')]
@@ -79,7 +79,7 @@ def main() -> None:
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
-        rclpy.try_shutdown()
+        shutdown()
 
 
 if __name__ == '__main__':

@@ -18,7 +18,7 @@ from rclpy.node import Node
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.hand import side_of
 from hand_pose_ros.msg import HandJointsArray
-from hand_pose_ros.ros import init
+from hand_pose_ros.ros import init, shutdown
 from hand_pose_ros.skeleton import get_skeleton
 
 
@@ -52,7 +52,7 @@ def main() -> None:
     except HandPoseError as error:
         sys.exit(f'hand/joints: {error}')
     finally:
-        rclpy.try_shutdown()
+        shutdown()
 
 
 if __name__ == '__main__':

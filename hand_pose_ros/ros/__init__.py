@@ -1,6 +1,7 @@
 """The ROS 2 side. Only this package imports rclpy or messages."""
 
 import re
+from contextlib import suppress
 from typing import Any
 
 from hand_pose_ros.errors import HandPoseError
@@ -33,3 +34,9 @@ def init(args: list[str] | None = None, **options: Any) -> None:
             raise HandPoseError(f'ROS cannot write its log ({reason}): set the environment variable ROS_LOG_DIR to a '
                                 'folder that can be written') from error
         raise HandPoseError(f'the arguments of ROS cannot be used: {reason}') from error
+
+
+def shutdown() -> None:
+    """Call rclpy.try_shutdown. After Ctrl-C, a thread of rclpy shuts down, too, and the two may meet."""
+    with suppress(RuntimeError):  # RCLError: it is shut down already
+        rclpy.try_shutdown()

@@ -124,7 +124,7 @@ def play_through_node(bag: DepthBag, camera_info_topic: str | None = None,
                        {stamp: at - seen[stamp] for stamp, (at, _) in answers.items() if stamp in seen})
     finally:
         if ours:
-            rclpy.try_shutdown()
+            ros.shutdown()
 
 
 class _Listener:

@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.srv import ChangeState
 from numpy.typing import NDArray
@@ -195,8 +194,11 @@ class EstimatorNode(LifecycleNode):
         self._camera.close()
         self._worker.stop()
         self._worker = None
-        if self.context.ok():
+        try:
             self._outputs.clear(self._last_header)
+        except RuntimeError:  # RCLError: after Ctrl-C, a thread of rclpy shuts down, and nothing can be published
+            if self.context.ok():
+                raise
 
     # Callbacks
 
@@ -367,5 +369,5 @@ def main(args: list[str] | None = None) -> int:
     finally:
         if node is not None:
             node.destroy_node()
-        rclpy.try_shutdown()
+        ros.shutdown()
     return 0

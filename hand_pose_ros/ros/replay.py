@@ -232,7 +232,7 @@ def replaying(path: str | PathLike[str], ros_args: Sequence[str] = (), **options
         with Bag(path) as bag, closing(Replay(bag, **options)) as replay:
             yield replay
     finally:
-        rclpy.try_shutdown()
+        ros.shutdown()
 
 
 def _is_latched(connection: Connection) -> bool:

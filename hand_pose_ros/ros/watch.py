@@ -47,7 +47,7 @@ def watch(on_depth: OnDepth, on_hands: OnHands, transport: str = 'raw', depth_sc
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
-        rclpy.try_shutdown()
+        ros.shutdown()
 
 
 class _Watcher:

@@ -16,15 +16,19 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('hand_pose_ros.msg', reason='needs the compiled messages')
 
+import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 from test_node import Rig, camera_info, depth_with_hand, image, rig  # noqa: F401 (fixtures)
 from visualization_msgs.msg import Marker, MarkerArray
 
 from hand_pose_ros.cli import main
 from hand_pose_ros.msg import HandJointsArray
+from hand_pose_ros.ros import shutdown
+from hand_pose_ros.ros.node import EstimatorNode
 
 pytestmark = pytest.mark.usefixtures('ros_domain', 'load_once')
 
@@ -177,3 +181,26 @@ def test_the_command_starts_and_ends_cleanly(rig: Rig) -> None:
         process.kill()
     assert process.returncode == 0
     assert 'Traceback' not in errors
+
+
+def test_the_node_ends_while_rclpy_shuts_down(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After Ctrl-C, a thread of rclpy shuts down, too. Neither may end in a traceback."""
+    context = rclpy.Context()
+    context.init()
+    node = EstimatorNode(context=context, parameter_overrides=[
+        Parameter('model', value=str(weights)), Parameter('autostart', value=False)])
+    node.trigger_configure()
+    node.trigger_activate()
+    clear = node._outputs.clear
+
+    def late(header: object) -> None:
+        context.shutdown()
+        clear(header)
+
+    monkeypatch.setattr(node._outputs, 'clear', late)
+    node.destroy_node()
+    assert not context.ok()
+    monkeypatch.setattr(rclpy, 'try_shutdown', context.shutdown)
+    with pytest.raises(RuntimeError):
+        rclpy.try_shutdown()
+    shutdown()

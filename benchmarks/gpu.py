@@ -27,13 +27,13 @@ BATCHES = (64, 1024, 4096)
 
 def graph_alone(engine: CudaEngine, replays: int = 500) -> float:
     """Milliseconds of a replay whose input and output stay on the GPU."""
-    source = some_patches(1).to(engine.device)
-    with torch.inference_mode(), torch.cuda.stream(engine.stream), exact_convolutions():
+    source, stream = some_patches(1).to(engine.device, engine.pipeline.precision), engine.streams[0]
+    with torch.inference_mode(), torch.cuda.stream(stream), exact_convolutions():
         for _ in range(WARM_UP):
             engine.pipeline(source)
-        engine.stream.synchronize()
+        stream.synchronize()
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph, stream=engine.stream):
+        with torch.cuda.graph(graph, stream=stream):
             engine.pipeline(source)
         start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
         graph.replay()
@@ -50,9 +50,8 @@ def with_copies(engine: CudaEngine) -> Callable[[], None]:
     captured = engine.captured_for(1)
 
     def call() -> None:
-        with torch.cuda.stream(engine.stream):
-            captured.graph.replay()
-        engine.stream.synchronize()
+        captured.start()
+        captured.done.synchronize()
     return call
 
 

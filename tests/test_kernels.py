@@ -1,5 +1,6 @@
 """Kernels of our own for a GPU give what PyTorch gives. Without a GPU, Triton interprets them on the CPU."""
 
+import copy
 import os
 
 import pytest
@@ -12,10 +13,11 @@ if DEVICE == 'cpu':
     os.environ['TRITON_INTERPRET'] = '1'  # read when Triton is imported
 pytest.importorskip('triton', reason='needs Triton, which comes with PyTorch for CUDA')
 
-from hand_pose_ros.models import build  # noqa: E402
+from hand_pose_ros.models import build, dense  # noqa: E402
 from hand_pose_ros.models.refiner import FAR, _framed, cut  # noqa: E402
 from hand_pose_ros.runtime import cuda_engine, kernels  # noqa: E402
-from hand_pose_ros.runtime.fused import ConvolutionReLU, LinearReLU, fuse  # noqa: E402
+from hand_pose_ros.runtime.engine import Pipeline  # noqa: E402
+from hand_pose_ros.runtime.fused import Convolution, FusedRefinement, Linear, fuse  # noqa: E402
 
 
 @pytest.fixture(autouse=True)
@@ -25,27 +27,55 @@ def single_precision():
         yield
 
 
-@pytest.mark.parametrize(('inputs', 'filters', 'size', 'pool', 'side', 'groups'), [
-    (1, 8, 5, 4, 33, 1), (8, 8, 5, 2, 16, 1), (8, 8, 3, 1, 7, 1), (1, 8, 5, 2, 14, 3), (8, 4, 3, 2, 9, 2)])
+CONVOLUTIONS = [
+    # inputs, filters, size, stride, padding, pool, side, groups
+    (1, 8, 5, 1, 0, 4, 33, 1), (8, 8, 5, 1, 0, 2, 16, 1), (8, 8, 3, 1, 0, 1, 7, 1), (1, 8, 5, 1, 0, 2, 14, 3),
+    (8, 4, 3, 1, 0, 2, 9, 2), (1, 16, 5, 2, 2, 2, 24, 1), (16, 24, 3, 2, 1, 1, 12, 1), (24, 20, 3, 1, 1, 1, 8, 1),
+    (20, 42, 1, 1, 0, 1, 6, 1), (16, 32, 1, 2, 0, 1, 8, 1)]
+
+
+@pytest.mark.parametrize('convolution', CONVOLUTIONS, ids=str)
 @pytest.mark.parametrize('dtype', [torch.float32, torch.float16])
-def test_a_convolution_with_its_pooling_and_relu(inputs, filters, size, pool, side, groups, dtype):
-    layer = nn.Conv2d(inputs * groups, filters * groups, size, groups=groups).to(memory_format=torch.channels_last)
+@pytest.mark.parametrize('layout', [torch.contiguous_format, torch.channels_last])
+def test_a_convolution_with_what_follows_it(convolution, dtype, layout):
+    inputs, filters, size, stride, padding, pool, side, groups = convolution
+    layer = nn.Conv2d(inputs * groups, filters * groups, size, stride, padding, groups=groups)
     x = torch.randn(2, inputs * groups, side, side)
-    assert kernels.fits(layer, pool)
-    expected = F.relu(F.max_pool2d(layer(x), pool))
-    answer = kernels.convolve(x.to(DEVICE, dtype), layer.to(DEVICE, dtype), pool)
+    plain, own = layer(x), copy.deepcopy(layer).to(DEVICE, dtype).to(memory_format=layout)
+    assert kernels.fits(own, pool)
+    shown = x.to(DEVICE, dtype).to(memory_format=layout)
+    tolerance = {'rtol': 0, 'atol': 2e-5 if dtype == torch.float32 else 1e-2}
+    answer = kernels.convolve(shown, own, pool)
     assert answer.dtype == dtype
-    torch.testing.assert_close(answer.float().cpu(), expected, rtol=0, atol=1e-5 if dtype == torch.float32 else 5e-3)
+    torch.testing.assert_close(answer.float().cpu(), F.relu(F.max_pool2d(plain, pool)), **tolerance)
+    planes = kernels.convolve(shown, own, pool, relu=False, planes=True)
+    assert planes.dtype == torch.float32 and planes.is_contiguous()
+    torch.testing.assert_close(planes.cpu(), F.max_pool2d(plain, pool), **tolerance)
+    if pool == 1 and plain.shape[2] % 2 == 0:
+        added = torch.randn(2, filters * groups, plain.shape[2] // 2, plain.shape[2] // 2)
+        for more in added, F.interpolate(added, scale_factor=2):
+            answer = kernels.convolve(shown, own, added=more.to(DEVICE, dtype))
+            expected = F.relu(plain + F.interpolate(added, scale_factor=2))
+            torch.testing.assert_close(answer.float().cpu(), expected, **tolerance)
 
 
-@pytest.mark.parametrize('relu', [True, False])
+def test_a_convolution_of_other_kinds_is_left_to_pytorch():
+    for options in ({'stride': (1, 2)}, {'padding': (1, 0)}, {'padding': 'same'}, {'dilation': 2}, {'bias': False},
+                    {'padding': 1, 'padding_mode': 'reflect'}):
+        assert not kernels.fits(nn.Conv2d(8, 8, 3, **options), 1)
+    assert not kernels.fits(nn.Conv2d(8, 8, (3, 1)), 1)
+    assert not kernels.fits(nn.Conv2d(8, 8, 3), 3)
+
+
+@pytest.mark.parametrize(('slope', 'activation'), [(1, nn.Identity()), (0, nn.ReLU()), (0.1, nn.LeakyReLU(0.1))])
 @pytest.mark.parametrize(('inputs', 'outputs'), [(968, 40), (30, 63), (7, 1)])
-def test_a_linear_layer(inputs, outputs, relu):
-    layer, x = nn.Linear(inputs, outputs), torch.randn(3, inputs)
-    expected = F.relu(layer(x)) if relu else layer(x)
+def test_a_linear_layer_with_what_follows_it(inputs, outputs, slope, activation):
+    layer, x, added = nn.Linear(inputs, outputs), torch.randn(3, inputs), torch.randn(3, outputs)
+    expected = activation(layer(x))
     layer = layer.to(DEVICE)
-    answer = kernels.linear(x.to(DEVICE), layer.weight, layer.bias, relu).cpu()
-    torch.testing.assert_close(answer, expected, rtol=0, atol=1e-5)
+    for more in None, added.to(DEVICE):
+        answer = kernels.linear(x.to(DEVICE), layer.weight, layer.bias, slope, more).cpu()
+        torch.testing.assert_close(answer, expected if more is None else expected + added, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize('refiner', ['std_ref', 'or_ref'])
@@ -60,17 +90,103 @@ def test_cuts_around_joints_in_the_image_at_its_border_and_outside(refiner):
         torch.testing.assert_close(answer, cut(image, joints, region), rtol=0, atol=1e-5)
 
 
+def patches() -> torch.Tensor:
+    """A wall of noise, a hand that ends at a border, a single pixel, and nothing."""
+    shown = torch.ones(4, 1, 128, 128)
+    shown[0] = torch.rand(128, 128) * 1.9 - 1
+    shown[1, :, 30:90, :50] = torch.rand(60, 50) - 0.5
+    shown[2, :, 64, 3] = -0.25
+    return shown
+
+
+def test_cells_that_see_something_and_those_that_do_not():
+    shown = patches()
+    for answer, expected in zip(kernels.cells(shown.to(DEVICE)), dense.cells(shown), strict=True):
+        torch.testing.assert_close(answer.cpu(), expected, rtol=0, atol=1e-6)
+
+
+def test_joints_from_votes():
+    positions, seen = dense.cells(patches())
+    maps = torch.randn(4, 5 * 4, 32, 32)  # five joints
+    directions, closeness = maps[:, :15].unflatten(1, (5, 3)), maps[:, 15:] / 3
+    maps = torch.cat([directions.flatten(1, 2), closeness], dim=1).to(DEVICE)
+    answer = kernels.decode(positions.to(DEVICE), seen.to(DEVICE), maps[:, :15].unflatten(1, (5, 3)), maps[:, 15:])
+    for told, expected in zip(answer, dense.decode(positions, seen, directions, closeness), strict=True):
+        torch.testing.assert_close(told.cpu(), expected, rtol=0, atol=1e-5)
+
+
+def test_the_second_look_sees_what_it_would():
+    network, shown = build('two_looks', width=4), patches()
+    joints = 0.5 * torch.randn(4, 21, 3)
+    joints[1] = 0  # no direction
+    joints[2] += torch.tensor([1.3, 0, -0.4])  # looks beyond the patch
+    size = torch.tensor([0.0, -0.7, 0.2, 2.0])
+    (middle, turn, scale), seen = kernels.seen(network, *(x.to(DEVICE) for x in (shown, joints, size)))
+    view, expected = network.seen(shown, joints, size)
+    for told, part in zip((middle, turn, scale), view, strict=True):
+        torch.testing.assert_close(told.cpu(), part, rtol=0, atol=1e-6)
+    torch.testing.assert_close(seen.cpu(), expected, rtol=0, atol=1e-5)
+
+
+def test_the_refinement_of_joints_in_the_maps_at_their_border_and_outside():
+    refinement = dense.JointRefinement(3, local=9 + 4, whole=6)
+    nn.init.normal_(refinement.output.weight, std=0.1)
+    for norm in refinement.norm, refinement.norm_whole:
+        nn.init.normal_(norm.running_mean)
+        nn.init.uniform_(norm.running_var, 0.5, 2)
+        nn.init.normal_(norm.weight)
+        nn.init.normal_(norm.bias)
+    joints = torch.tensor([[[0, 0, 0], [0.31, -0.77, 0.4], [1, 1, -0.2]],
+                           [[-1, 0.5, 0], [3, -7, 0], [-0.123, 0.999, 0.9]]])
+    local = torch.randn(2, 9, 16, 16), torch.randn(2, 4, 16, 16).to(memory_format=torch.channels_last)
+    told = joints, joints + 0.1, torch.randn(2, 3), local, torch.randn(2, 6)
+    expected = refinement.eval()(*told)
+    owner = nn.ModuleDict({'refinement': refinement})
+    fuse(owner, kernels)
+    owner.to(DEVICE)
+    told = *(x.to(DEVICE) for x in told[:3]), [x.to(DEVICE) for x in local], told[4].to(DEVICE)
+    assert isinstance(owner['refinement'], FusedRefinement)
+    torch.testing.assert_close(owner['refinement'](*told).cpu(), expected, rtol=0, atol=1e-5)
+    torch.testing.assert_close(owner['refinement'].plain(*told).cpu(), expected, rtol=0, atol=1e-5)
+
+
 def test_few_hands_are_computed_by_them_and_many_give_the_same():
-    layers = nn.Sequential(nn.Sequential(nn.Conv2d(1, 8, 3), nn.MaxPool2d(2), nn.ReLU()), nn.Flatten(),
-                           nn.Linear(8 * 9, 5), nn.ReLU(), nn.Linear(5, 2)).to(DEVICE)
+    layers = nn.Sequential(nn.Sequential(nn.Conv2d(1, 12, 3), nn.MaxPool2d(2), nn.ReLU()), nn.Flatten(),
+                           nn.Linear(12 * 9, 5), nn.ReLU(), nn.Linear(5, 2)).to(DEVICE)
     x = torch.randn(kernels.HANDS + 1, 1, 8, 8, device=DEVICE)
     expected = layers(x)
     fuse(layers, kernels)
-    assert isinstance(layers[0][0], ConvolutionReLU)
-    assert isinstance(layers[2], LinearReLU)
-    assert isinstance(layers[4], LinearReLU)
+    assert [type(layer) for layer in (layers[0][0], layers[2], layers[4])] == [Convolution, Linear, Linear]
+    assert not kernels.gains(layers[0][0].convolution, len(x))
     torch.testing.assert_close(layers(x), expected, rtol=0, atol=1e-5)
     torch.testing.assert_close(layers(x[:2]), expected[:2], rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize('hands', [2, 17])
+def test_few_filters_are_computed_by_them_for_any_number_of_hands(hands):
+    layer = nn.Conv2d(1, 8, 3).to(DEVICE)
+    x = torch.randn(hands, 1, 12, 12, device=DEVICE)
+    assert kernels.gains(layer, hands)
+    torch.testing.assert_close(kernels.convolve(x, layer, 2), F.relu(F.max_pool2d(layer(x), 2)), rtol=0, atol=1e-5)
+
+
+def test_a_dense_network_of_two_looks_is_the_same():
+    network = build('two_looks', width=12, bottleneck=8, refined=True, first={'width': 8, 'bottleneck': 8}).eval()
+    for each in network.first, network.second:
+        each.maps.weight.mul_(30)
+    shown = patches()[1:2]
+    pipeline = Pipeline(copy.deepcopy(network))
+    fuse(pipeline, kernels)
+    for answer, expected in zip(pipeline.to(DEVICE)(shown.to(DEVICE)), Pipeline(network)(shown), strict=True):
+        torch.testing.assert_close(answer.cpu(), expected, rtol=0, atol=1e-4)
+
+
+def test_what_is_copied_is_the_same():
+    source, target = torch.randn(3, 1, 40, 40), torch.zeros(3, 1, 40, 40, pin_memory=DEVICE == 'cuda')
+    kernels.copy(source.to(DEVICE), target)
+    if DEVICE == 'cuda':
+        torch.cuda.synchronize()
+    assert torch.equal(source, target)
 
 
 def test_a_gpu_does_without_kernels_that_are_interpreted(caplog):

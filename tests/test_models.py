@@ -404,7 +404,7 @@ def test_a_refinement_starts_as_the_identity_and_learns_from_what_is_seen_at_the
         near = (-((line[:, None] - rows[:, joint, None, None]) ** 2 + (line - cols[:, joint, None, None]) ** 2) / 32)
         local[:, 0] += near.exp()
         local[:, 1] += near.exp() * truth[:, joint, 2, None, None]
-    told = joints, joints, torch.zeros(400, 4), local, torch.randn(400, 3)
+    told = joints, joints, torch.zeros(400, 4), local.split(1, dim=1), torch.randn(400, 3)
     refinement = JointRefinement(4, local=2, whole=3)
     torch.testing.assert_close(refinement(*told), joints)
     optimizer = torch.optim.AdamW(refinement.parameters(), 1.4e-3)
@@ -422,7 +422,7 @@ def test_where_a_refinement_reads_is_no_output_and_never_outside():
     nn.init.zeros_(refinement.each[:, 3:])  # what is told, and not read
     joints = torch.tensor([[[0.8, -0.6, 0.1], [1.0, -1.0, 0.0]]], requires_grad=True)
     local = torch.randn(1, 3, 32, 32, requires_grad=True)
-    rest = torch.zeros(1, 2, 3), torch.zeros(1, 2), local, torch.randn(1, 4)
+    rest = torch.zeros(1, 2, 3), torch.zeros(1, 2), [local], torch.randn(1, 4)
     moved = refinement(joints, *rest) - joints
     moved.sum().backward()
     assert moved.abs().max() > 0 and joints.grad.abs().max() == 0
@@ -532,8 +532,8 @@ def test_a_turn_of_the_patch_is_not_seen_by_the_second_look():
 def test_two_looks_say_everything_of_the_patch_as_it_is():
     network = build('two_looks', width=8).eval()
     patches = torch.cat([hand_patches(2), torch.ones(1, 1, 128, 128)])
-    answer, view = network.forward_full(patches), network.view(patches)
-    seen = network.second.forward_full(view.patch(patches))
+    answer, (view, shown) = network.forward_full(patches), network.look(patches)
+    seen = network.second.forward_full(shown)
     assert answer.keys() == set(network.outputs)
     torch.testing.assert_close(view.into(answer['joints']), seen['joints'], atol=1e-5, rtol=0)
     torch.testing.assert_close(answer['size'], seen['size'] + torch.log(view.scale))

@@ -259,6 +259,8 @@ def test_a_hand_gets_several_threads_where_they_are_faster(seconds, threads, mon
 @pytest.mark.parametrize('count', [0, 1, LARGEST, 3 * LARGEST + 5])
 def test_many_hands_run_by_turns_in_graphs_that_none_overwrites_too_soon(count, monkeypatch):
     """With graphs that do their work when they are waited for, at the latest possible time."""
+    streams = []
+
     class Late:
         def __init__(self, size: int) -> None:
             self.patches, self.joints = torch.zeros(size, 1, 128, 128), torch.zeros(size, 21, 3)
@@ -266,25 +268,28 @@ def test_many_hands_run_by_turns_in_graphs_that_none_overwrites_too_soon(count, 
         def replay(self) -> None:
             self.pending = True
 
-        def record(self) -> None:
-            assert self.pending
+        def record(self, stream: str) -> None:
+            assert self.pending and streams[-1] == stream
 
         def synchronize(self) -> None:
             self.joints.copy_(self.patches[:, 0, 0, 0, None, None].expand_as(self.joints))
 
-    def capture(engine: CudaEngine, size: int) -> _Captured:
+    def capture(engine: CudaEngine, size: int, stream: str) -> _Captured:
         late = Late(size)
-        return _Captured(late, late.patches, (late.joints,), late)
+        return _Captured(late, late.patches, (late.joints,), stream, late)
 
     monkeypatch.setattr(CudaEngine, '_capture', capture)
+    monkeypatch.setattr('torch.cuda.current_stream', lambda: 'own')
+    monkeypatch.setattr('torch.cuda.set_stream', streams.append)
     engine = object.__new__(CudaEngine)
-    engine.outputs, engine.stream, engine._captured = ('joints',), None, {}
+    engine.outputs, engine.streams, engine._captured = ('joints',), ('even', 'odd'), {}
     patches = np.zeros((count, 1, 128, 128), np.float32)
     patches[:, 0, 0, 0] = np.arange(count)
     joints = engine.run(patches)
     assert joints.shape == (count, 21, 3)
     np.testing.assert_array_equal(joints[:, 0, 0], np.arange(count))
     assert len(engine._captured) <= 3
+    assert streams == ['even', 'own', 'odd', 'own', 'even', 'own', 'odd', 'own'][:2 * max(1, -(-count // LARGEST))]
     sizes = {0: {1}, 1: {1}, LARGEST: {LARGEST}}.get(count, {LARGEST, 8})  # powers of two, the next larger ones
     assert {size for size, _ in engine._captured} == sizes
 

@@ -36,8 +36,7 @@ def main() -> None:
     batch = next(iter(frames(50)))
     chosen = batch['hand_present'].nonzero()[:HANDS, 0]
     patch = batch['patch'][chosen]
-    view, first = network.view(patch), network.first(patch)
-    seen = view.patch(patch)
+    (_, seen), first = network.look(patch), network.first(patch)
     second = network.second(seen)
     pictures = [*map(picture, patch, first), *map(picture, seen, second)]
     sheet = contact_sheet(pictures, columns=HANDS)

@@ -29,6 +29,8 @@ HAND_PER_CUBE = 0.19 / 0.30
 the bones to the tip of the middle finger."""
 SHARPNESS = 30.0
 """Weight of a vote: exp(SHARPNESS * closeness)."""
+LEAK = 0.1
+"""Slope of the leaky ReLU of the refinement."""
 ADDED = re.compile(r'\bstages\.\d+\.[1-9]\d*\.|\brefinement\.')
 """Matches the names of weights that can be added to a trained network, because they start as the identity: all blocks
 of a stage but the first, and the refinement."""
@@ -105,7 +107,7 @@ class HandDense(nn.Module):
         for inputs, outputs, count in zip((w, w, 2 * w, 4 * w), (w, 2 * w, 4 * w, 8 * w), blocks, strict=True):
             further = [Residual(outputs, outputs, 1) for _ in range(count - 1)]
             self.stages.append(nn.Sequential(Residual(inputs, outputs, 1 if inputs == outputs else 2), *further))
-        self.laterals = nn.ModuleList(nn.Conv2d(k * w, 2 * w, 1) for k in (1, 2, 4, 8))
+        self.laterals = nn.ModuleList(Lateral(k * w, 2 * w, 1) for k in (1, 2, 4, 8))
         self.fuse = nn.Sequential(conv_norm(2 * w, 2 * w, 3), nn.ReLU())
         self.maps = nn.Conv2d(2 * w, 4 * joints, 1)
         self.summary = plain_linear(8 * w + joints, joints + 3)
@@ -113,6 +115,7 @@ class HandDense(nn.Module):
         self.refinement = JointRefinement(joints, 3 * w, 8 * w) if refined else None
         nn.init.normal_(self.maps.weight, std=0.01)
         nn.init.zeros_(self.maps.bias)  # type: ignore[arg-type]
+        self.cells, self.decode = cells, decode  # an engine may have faster ones
 
     def set_prior(self, mean: ArrayLike, components: ArrayLike) -> None:
         """Start the prior from a mean (3J,) and components (bottleneck, 3J): see `fit_prior`."""
@@ -142,18 +145,18 @@ class HandDense(nn.Module):
         maps = self.maps(fused).float().contiguous()
         directions = maps[:, :3 * self.joints].unflatten(1, (self.joints, 3))
         closeness = maps[:, 3 * self.joints:]
-        positions, seen = cells(patch.float())
+        positions, seen = self.cells(patch.float())
         with torch.autocast(patch.device.type, enabled=False):  # also not when training in half precision
-            votes, agreement = decode(positions, seen, directions, closeness)
-        whole = features[-1].mean(dim=(2, 3))  # (B, 8w)
-        summary = self.summary(torch.cat([whole, agreement.to(whole.dtype)], dim=1))
+            votes, agreement = self.decode(positions, seen, directions, closeness)
+        whole = features[-1].mean(dim=(2, 3), dtype=torch.float32)  # (B, 8w)
+        summary = self.summary(torch.cat([whole, agreement], dim=1).to(self.summary.weight.dtype))
         confidence = summary[:, :self.joints]
         with torch.autocast(patch.device.type, enabled=False):
             # The confidence must say how sure a joint is. The prior must not train it to say something else.
             unrefined = votes if self.head is None else self.head(votes, confidence.detach())
             joints = unrefined
             if self.refinement is not None:
-                local = torch.cat([fused, features[0]], dim=1)
+                local = fused, features[0]
                 joints = self.refinement(unrefined, votes, confidence.detach(), local, whole)
         return {
             'joints': joints, 'confidence': confidence,
@@ -175,8 +178,16 @@ def pyramid(x: Tensor, stages: nn.ModuleList, laterals: nn.ModuleList) -> tuple[
         features.append(x)
     fused = laterals[-1](x)
     for lateral, feature in zip(laterals[-2::-1], features[-2::-1], strict=True):
-        fused = F.interpolate(fused, scale_factor=2, mode='nearest') + lateral(feature)
+        fused = lateral(feature, fused)
     return features, fused
+
+
+class Lateral(nn.Conv2d):
+    """A projection of the features of one stage. The sum of those of the coarser stages is added."""
+
+    def forward(self, x: Tensor, coarser: Tensor | None = None) -> Tensor:
+        own = super().forward(x)
+        return own if coarser is None else F.interpolate(coarser, scale_factor=2, mode='nearest') + own
 
 
 class JointRefinement(nn.Module):
@@ -206,22 +217,23 @@ class JointRefinement(nn.Module):
         nn.init.zeros_(self.output.weight)
         nn.init.zeros_(self.output.bias)
 
-    def forward(self, joints: Tensor, votes: Tensor, confidence: Tensor, local: Tensor, whole: Tensor) -> Tensor:
+    def forward(self, joints: Tensor, votes: Tensor, confidence: Tensor, local: Sequence[Tensor],
+                whole: Tensor) -> Tensor:
         """Better joints (B, J, 3), in cube units.
 
         Args:
             joints, votes: (B, J, 3) in cube units; the votes are those for the joints.
             confidence: (B, J) logits of how sure the joints are.
-            local: maps (B, C, H, W).
+            local: maps (B, C, H, W), C channels in all.
             whole: features of the whole patch (B, F).
         """
         dtype = self.all.weight.dtype
-        joints, votes, confidence, local, whole = (x.to(dtype) for x in (joints, votes, confidence, local, whole))
+        joints, votes, confidence, whole = (x.to(dtype) for x in (joints, votes, confidence, whole))
         # No gradient for the places: the maps learn from what was read, not from where else it could have been read.
         places = joints[:, :, None, :2].detach().clamp(-1, 1)
-        read = F.grid_sample(local, places, align_corners=False)[..., 0]  # (B, C, J)
+        read = [F.grid_sample(maps.to(dtype), places, align_corners=False)[..., 0] for maps in local]  # (B, C, J)
         told = torch.cat([joints, votes, confidence[..., None]], dim=2)
-        x = self.norm(torch.cat([read, told.transpose(1, 2)], dim=1))
+        x = self.norm(torch.cat([*read, told.transpose(1, 2)], dim=1))
         x = _active(torch.baddbmm(self.bias, x.permute(2, 0, 1), self.each)).transpose(0, 1)  # (B, J, WIDTH)
         x = _active(self.all(torch.cat([x.flatten(1), self.norm_whole(whole)], dim=1)))
         x = x + _active(self.hidden(x))
@@ -230,7 +242,7 @@ class JointRefinement(nn.Module):
 
 def _active(x: Tensor) -> Tensor:
     # With plain ReLU, hundreds of units die while the output is still zero, and the refinement never starts to learn.
-    return F.leaky_relu(x, 0.1)
+    return F.leaky_relu(x, LEAK)
 
 
 class Residual(nn.Module):

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from hand_pose_ros.errors import HandPoseError
-from hand_pose_ros.models.dense import Residual, conv_norm, pyramid
+from hand_pose_ros.models.dense import Lateral, Residual, conv_norm, pyramid
 
 FOCAL = 128.0
 """Focal length of the images in pixels. A hand at 1 m is about 23 pixels large."""
@@ -58,7 +58,7 @@ class HandFinder(nn.Module):
                                   conv_norm(w // 2, w, 3, stride=2), nn.ReLU())
         self.stages = nn.ModuleList([Residual(w, w, 1), Residual(w, 2 * w, 2),
                                      Residual(2 * w, 4 * w, 2), Residual(4 * w, 4 * w, 2)])
-        self.laterals = nn.ModuleList(nn.Conv2d(k * w, w, 1) for k in (1, 2, 4, 4))
+        self.laterals = nn.ModuleList(Lateral(k * w, w, 1) for k in (1, 2, 4, 4))
         self.fuse = nn.Sequential(conv_norm(w, w, 3), nn.ReLU())
         self.maps = nn.Conv2d(w, 4, 1)
         nn.init.normal_(self.maps.weight, std=0.01)

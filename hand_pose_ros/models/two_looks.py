@@ -112,11 +112,17 @@ class TwoLooks(nn.Module):
         self.first.eval()
         return self
 
-    def view(self, patch: Tensor) -> View:
-        """The view of the second look at patches (B, 1, 128, 128). No gradient passes through it."""
+    def look(self, patch: Tensor) -> tuple[View, Tensor]:
+        """The view of the second look at patches (B, 1, 128, 128), and the patches in it. No gradient passes through.
+        """
         with torch.no_grad():
             first = self.first.forward_full(patch)
-            return self.upright(first['joints'], first['size'])
+            return self.seen(patch, first['joints'], first['size'])
+
+    def seen(self, patch: Tensor, joints: Tensor, size: Tensor) -> tuple[View, Tensor]:
+        """The same, where joints and size of the hands are known (see `upright`)."""
+        view = self.upright(joints, size)
+        return view, view.patch(patch)
 
     def upright(self, joints: Tensor, size: Tensor) -> View:
         """The view in which hands are upright, in the middle and equally large.
@@ -141,10 +147,10 @@ class TwoLooks(nn.Module):
 
     def forward_full(self, patch: Tensor) -> dict[str, Tensor]:
         """(B, 1, 128, 128) in [-1, 1] -> joints, confidence, hand, side and size, as in `HandDense.forward_full`."""
-        view = self.view(patch)
-        seen = self.second.forward_full(view.patch(patch))
-        return {**{name: seen[name] for name in self.outputs},
-                'joints': view.back(seen['joints'].float()), 'size': seen['size'].float() + view.scale.log()}
+        view, seen = self.look(patch)
+        second = self.second.forward_full(seen)
+        return {**{name: second[name] for name in self.outputs},
+                'joints': view.back(second['joints'].float()), 'size': second['size'].float() + view.scale.log()}
 
 
 def _turned(points: Tensor, turn: Tensor) -> Tensor:

@@ -45,7 +45,7 @@ class Pipeline(nn.Module):
             if tensor.is_floating_point() and id(tensor) not in kept:
                 tensor.data = tensor.data.half()
         for each in dense:
-            each.stem = nn.Sequential(each.stem, _As(each.maps.weight.dtype))
+            each.stem = nn.Sequential(each.stem, _As(each.summary.weight.dtype))
         return self
 
     @property

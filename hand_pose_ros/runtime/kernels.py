@@ -1,8 +1,8 @@
-"""GPU kernels of our own (in Triton). Each does in one kernel what PyTorch does for small layers in three to thirty.
+"""GPU kernels of our own (in Triton). Each does in one kernel what PyTorch does for small layers in three to forty.
 
-For one hand, the number of kernels decides the time, at two to three microseconds each; what they compute does not.
-There are three kernels: a convolution of few channels with its pooling and ReLU, a linear layer with its ReLU, and the
-cut around a joint of the refiner. All read and write the precision of their input, and compute in float32.
+For few hands, the number of kernels decides the time, at one and a half to five microseconds each; what they compute
+hardly matters. There are: a convolution with what follows it, a linear layer with what follows it, the cut around a
+joint of the refiner, and four steps of `models.dense` and `models.two_looks`. All compute in float32.
 """
 
 # Functions that Triton compiles take pointers and numbers of Triton's types.
@@ -10,51 +10,77 @@ cut around a joint of the refiner. All read and write the precision of their inp
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import torch
 import triton
 import triton.language as tl
 from torch import Tensor, nn
 
 from hand_pose_ros.geometry import PATCH_SIZE
+from hand_pose_ros.models.dense import CELLS, LEAK, REACH, SHARPNESS
 from hand_pose_ros.models.refiner import Region
+from hand_pose_ros.models.two_looks import MAX_SIZE, STEPS, ZOOM, TwoLooks, View
 
 HANDS = 16
-"""With more hands at a time, PyTorch is faster. These kernels read the weights again for each hand, and the pixels
-again for each filter."""
-_PROGRAMS, _LARGE, _SMALL = 128, 512, 128
-"""About the number of processors of a GPU; the number of values per program if there are enough programs for all
-processors; and the same if there are not."""
+"""With more hands at a time, PyTorch is faster for most layers."""
+FEW = 8
+"""With so few filters, tensor cores would idle in PyTorch's convolutions."""
 
 
 @triton.jit
-def _convolve(x, weight, bias, y, groups, height, width, rows, columns, s_filter, s_channel, s_row, s_column,
-              INPUTS: tl.constexpr, FILTERS: tl.constexpr, SIZE: tl.constexpr, POOL: tl.constexpr,
-              CELLS: tl.constexpr):
-    """One group of one image: FILTERS at CELLS places of the answer, with all positions that are pooled for them."""
-    plane = tl.program_id(0)
-    group = plane % groups
-    plane = plane.to(tl.int64)
-    cell = tl.program_id(1) * CELLS + tl.arange(0, CELLS)
-    inside = cell < rows * columns
-    pooled = tl.arange(0, POOL * POOL)
-    row = (cell // columns)[:, None] * POOL + (pooled // POOL)[None, :]
-    column = (cell % columns)[:, None] * POOL + (pooled % POOL)[None, :]
-    x += plane * INPUTS * height * width + row * width + column  # (CELLS, POOL * POOL)
-    number = tl.arange(0, FILTERS)
-    weight += (group * FILTERS + number) * s_filter
-    total = tl.zeros((CELLS, POOL * POOL, FILTERS), tl.float32)
-    for channel in range(INPUTS):
-        for i in tl.static_range(SIZE):
-            for j in tl.static_range(SIZE):
-                pixels = tl.load(x + (channel * height + i) * width + j, mask=inside[:, None], other=0)
-                taps = tl.load(weight + channel * s_channel + i * s_row + j * s_column)
-                total += pixels.to(tl.float32)[:, :, None] * taps.to(tl.float32)[None, None, :]
-    answer = tl.max(total, axis=1) + tl.load(bias + group * FILTERS + number).to(tl.float32)[None, :]
-    y += (plane * FILTERS + number)[None, :] * (rows * columns) + cell[:, None]
-    tl.store(y, tl.maximum(answer, 0).to(y.dtype.element_ty), mask=inside[:, None])
+def _convolve(x, weight, bias, added, y, groups, height, width, rows, columns,
+              x_hand, x_channel, x_row, x_column, w_filter, w_channel, w_row, w_column,
+              a_hand, a_channel, a_row, a_column, y_hand, y_channel, y_row, y_column,
+              INPUTS: tl.constexpr, FILTERS: tl.constexpr, SIZE: tl.constexpr, STRIDE: tl.constexpr,
+              PADDING: tl.constexpr, POOL: tl.constexpr, RELU: tl.constexpr, ENLARGED: tl.constexpr,
+              PLACES: tl.constexpr, TILE: tl.constexpr, PARTS: tl.constexpr, STEP: tl.constexpr):
+    """TILE filters of one group at PLACES of one image: a matrix product over channels and taps, in PARTS at a time.
+
+    Places that are pooled are neighbours. What is added is enlarged by ENLARGED; 0 = nothing is added.
+    """
+    hand, group = (tl.program_id(0) // groups).to(tl.int64), tl.program_id(0) % groups
+    place = tl.program_id(1) * PLACES + tl.arange(0, PLACES)
+    cell, pooled = place // (POOL * POOL), place % (POOL * POOL)
+    inside = (cell < rows * columns)[None, :, None]
+    top = ((cell // columns * POOL + pooled // POOL) * STRIDE - PADDING)[None, :, None]
+    left = ((cell % columns * POOL + pooled % POOL) * STRIDE - PADDING)[None, :, None]
+    number = tl.program_id(2) * TILE + tl.arange(0, TILE)
+    wanted = number < FILTERS
+    x += hand * x_hand + group * INPUTS * x_channel
+    weight += (group * FILTERS + number)[None, None, :] * w_filter
+    total = tl.zeros((PARTS, PLACES, TILE), tl.float32)
+    for start in range(0, INPUTS * SIZE * SIZE, PARTS * STEP):
+        k = start + tl.arange(0, PARTS)[:, None] * STEP + tl.arange(0, STEP)[None, :]
+        used = k < INPUTS * SIZE * SIZE
+        channel, i, j = k % INPUTS, k // INPUTS // SIZE, k // INPUTS % SIZE
+        row, column = top + i[:, None, :], left + j[:, None, :]
+        there = inside & used[:, None, :] & (row >= 0) & (row < height) & (column >= 0) & (column < width)
+        pixels = tl.load(x + row * x_row + column * x_column + channel[:, None, :] * x_channel, mask=there, other=0)
+        taps = tl.load(weight + (channel * w_channel + i * w_row + j * w_column)[:, :, None],
+                       mask=used[:, :, None] & wanted[None, None, :], other=0)
+        # Tensor cores compute float32 from three products, to nearly all of its digits.
+        total = tl.dot(pixels.to(taps.dtype), taps, total, input_precision='tf32x3')
+    total = tl.sum(total, axis=0)
+    WINDOWS: tl.constexpr = PLACES // (POOL * POOL)
+    if POOL > 1:
+        total = tl.max(tl.reshape(total, (WINDOWS, POOL * POOL, TILE)), axis=1)
+    cell = tl.program_id(1) * WINDOWS + tl.arange(0, WINDOWS)
+    kept = (cell < rows * columns)[:, None] & wanted[None, :]
+    row, column, filters = (cell // columns)[:, None], (cell % columns)[:, None], (group * FILTERS + number)[None, :]
+    total += tl.load(bias + filters, mask=wanted[None, :], other=0).to(tl.float32)
+    if ENLARGED > 0:
+        total += tl.load(added + hand * a_hand + filters * a_channel + row // ENLARGED * a_row
+                         + column // ENLARGED * a_column, mask=kept, other=0).to(tl.float32)
+    if RELU:
+        total = tl.maximum(total, 0)
+    tl.store(y + hand * y_hand + filters * y_channel + row * y_row + column * y_column,
+             total.to(y.dtype.element_ty), mask=kept)
 
 
 @triton.jit
-def _linear(x, weight, bias, y, inputs, outputs, RELU: tl.constexpr, OUTPUTS: tl.constexpr, BLOCK: tl.constexpr):
+def _linear(x, weight, bias, added, y, inputs, outputs, slope,
+            ADDED: tl.constexpr, OUTPUTS: tl.constexpr, BLOCK: tl.constexpr):
     """OUTPUTS values for one hand."""
     hand = tl.program_id(0)
     number = tl.program_id(1) * OUTPUTS + tl.arange(0, OUTPUTS)
@@ -67,8 +93,9 @@ def _linear(x, weight, bias, y, inputs, outputs, RELU: tl.constexpr, OUTPUTS: tl
                           mask=within[:, None] & (at < inputs)[None, :], other=0)
         total += values.to(tl.float32)[None, :] * factors.to(tl.float32)
     answer = tl.sum(total, axis=1) + tl.load(bias + number, mask=within, other=0).to(tl.float32)
-    if RELU:
-        answer = tl.maximum(answer, 0)
+    answer = tl.where(answer < 0, answer * slope, answer)
+    if ADDED:
+        answer += tl.load(added + hand * outputs + number, mask=within, other=0).to(tl.float32)
     tl.store(y + hand * outputs + number, answer.to(y.dtype.element_ty), mask=within)
 
 
@@ -103,41 +130,213 @@ def _between(first, second, fraction):
     return first + (second - first) * fraction
 
 
+@triton.jit
+def _cells(patch, positions, seen, WIDTH: tl.constexpr, SIZE: tl.constexpr):
+    """One row of the cells of one hand, as in `models.dense.cells`."""
+    hand, row, column = tl.program_id(0), tl.program_id(1), tl.arange(0, WIDTH)
+    at = (row * SIZE * WIDTH * SIZE + column * SIZE)[:, None] + tl.arange(0, SIZE)[None, :]
+    patch += hand * WIDTH * SIZE * WIDTH * SIZE
+    total, count = tl.zeros((WIDTH,), tl.float32), tl.zeros((WIDTH,), tl.float32)
+    for line in tl.static_range(SIZE):
+        pixels = tl.load(patch + at + line * WIDTH * SIZE).to(tl.float32)
+        total += tl.sum(tl.where(pixels < 1, pixels, 0), axis=1)
+        count += tl.sum((pixels < 1).to(tl.float32), axis=1)
+    cell = row * WIDTH + column
+    positions += hand * 3 * WIDTH * WIDTH + cell
+    tl.store(positions, (column + 0.5) * (2 / WIDTH) - 1)
+    tl.store(positions + WIDTH * WIDTH, tl.zeros((WIDTH,), tl.float32) + ((row + 0.5) * (2 / WIDTH) - 1))
+    tl.store(positions + 2 * WIDTH * WIDTH, tl.where(count > 0, total / tl.maximum(count, 1), 1))
+    tl.store(seen + hand * WIDTH * WIDTH + cell, (count > 0).to(tl.float32))
+
+
+@triton.jit
+def _decode(positions, seen, directions, closeness, joints, agreement, count, d_hand, c_hand,
+            ALL: tl.constexpr, SHARPNESS: tl.constexpr, REACH: tl.constexpr):
+    """One joint of one hand from the votes of ALL cells, as in `models.dense.decode`."""
+    hand, joint, cell = tl.program_id(0), tl.program_id(1), tl.arange(0, ALL)
+    close = tl.load(closeness + hand * c_hand + joint * ALL + cell)
+    votes = SHARPNESS * close - 1e4 * (1 - tl.load(seen + hand * ALL + cell))
+    weight = tl.exp(votes - tl.max(votes, axis=0))
+    weight /= tl.sum(weight, axis=0)
+    distance = REACH * (1 - close)
+    joints += (hand * count + joint) * 3
+    for axis in tl.static_range(3):
+        place = tl.load(positions + (hand * 3 + axis) * ALL + cell)
+        direction = tl.load(directions + hand * d_hand + (joint * 3 + axis) * ALL + cell)
+        tl.store(joints + axis, tl.sum(weight * (place + direction * distance), axis=0))
+    tl.store(agreement + hand * count + joint, tl.sum(weight * close, axis=0))
+
+
+@triton.jit
+def _look(patch, joints, size, middle, turn, scale, seen, count, root,
+          KNUCKLES: tl.constexpr, ONE: tl.constexpr, MOST: tl.constexpr, WIDTH: tl.constexpr, LINES: tl.constexpr,
+          ZOOM: tl.constexpr, MAX_SIZE: tl.constexpr, STEPS: tl.constexpr):
+    """LINES rows of one patch as the second look sees it: `TwoLooks.upright` and `View.patch`, which explain it.
+
+    KNUCKLES has a bit for each joint. ONE is the share of one knuckle in their mean.
+    """
+    hand, number = tl.program_id(0), tl.arange(0, MOST)
+    joints += hand * count * 3
+    there = number < count
+    all_x = tl.load(joints + number * 3, mask=there, other=0)
+    all_y = tl.load(joints + number * 3 + 1, mask=there, other=0)
+    all_z = tl.load(joints + number * 3 + 2, mask=there, other=0)
+    x = _rounded(tl.sum(all_x, axis=0) / count, STEPS)
+    y = _rounded(tl.sum(all_y, axis=0) / count, STEPS)
+    z = _rounded(tl.sum(all_z, axis=0) / count, STEPS)
+    share = tl.where(number == root, -1.0, 0.0)  # of each joint in the direction of the hand
+    for knuckle in tl.static_range(MOST):
+        if (KNUCKLES >> knuckle) & 1:
+            share += tl.where(number == knuckle, ONE, 0.0)
+    sin = -tl.sum(all_x * share, axis=0)
+    cos = 1e-6 - tl.sum(all_y * share, axis=0)
+    length = tl.sqrt(sin * sin + cos * cos)
+    sin, cos = _rounded(sin / length, STEPS), _rounded(cos / length, STEPS)
+    length = tl.sqrt(sin * sin + cos * cos)
+    sin, cos = sin / length, cos / length
+    larger = tl.minimum(tl.maximum(tl.load(size + hand).to(tl.float32), -MAX_SIZE), MAX_SIZE)
+    larger = ZOOM * tl.exp(_rounded(larger, STEPS))
+    if tl.program_id(1) == 0:
+        tl.store(middle + hand * 3, x)
+        tl.store(middle + hand * 3 + 1, y)
+        tl.store(middle + hand * 3 + 2, z)
+        tl.store(turn + hand * 4, cos)
+        tl.store(turn + hand * 4 + 1, -sin)
+        tl.store(turn + hand * 4 + 2, sin)
+        tl.store(turn + hand * 4 + 3, cos)
+        tl.store(scale + hand, larger)
+    line = tl.program_id(1) * LINES + tl.arange(0, LINES)[:, None]
+    across, down = tl.arange(0, WIDTH)[None, :] + (0.5 - WIDTH / 2), line + (0.5 - WIDTH / 2)
+    sin, cos = _rounded(sin * larger, 1024), _rounded(cos * larger, 1024)
+    column = tl.floor(across * cos + down * sin + (x + 1) * (WIDTH / 2)).to(tl.int32)
+    row = tl.floor(down * cos - across * sin + (y + 1) * (WIDTH / 2)).to(tl.int32)
+    inside = (row >= 0) & (row < WIDTH) & (column >= 0) & (column < WIDTH)
+    pixels = tl.load(patch + hand * WIDTH * WIDTH + row * WIDTH + column, mask=inside, other=1).to(tl.float32)
+    depth = tl.minimum(tl.maximum((pixels - z) / larger, -1), 1)
+    seen += hand * WIDTH * WIDTH + line * WIDTH + tl.arange(0, WIDTH)[None, :]
+    tl.store(seen, tl.where(pixels < 1, depth, 1).to(seen.dtype.element_ty))
+
+
+@triton.jit
+def _rounded(x, steps):
+    return tl.floor(x * steps + 0.5) / steps
+
+
+@triton.jit
+def _read(joints, votes, confidence, fused, finest, weight, bias, y, count, width,
+          f_hand, f_channel, f_row, f_column, s_hand, s_channel, s_row, s_column,
+          FUSED: tl.constexpr, FINEST: tl.constexpr, BLOCK: tl.constexpr, OUTPUTS: tl.constexpr, LEAK: tl.constexpr):
+    """The first layer of `models.dense.JointRefinement` for one joint: what two maps show there, and what is known."""
+    which, joint = tl.program_id(0) * count + tl.program_id(1), tl.program_id(1)
+    output = tl.arange(0, OUTPUTS)
+    weight += joint * (FUSED + FINEST + 7) * OUTPUTS + output
+    total = tl.load(bias + joint * OUTPUTS + output).to(tl.float32)
+    x_at = (tl.minimum(tl.maximum(tl.load(joints + which * 3), -1), 1) + 1) * width / 2 - 0.5
+    y_at = (tl.minimum(tl.maximum(tl.load(joints + which * 3 + 1), -1), 1) + 1) * width / 2 - 0.5
+    channel = tl.arange(0, BLOCK)
+    local = _sample(fused + tl.program_id(0) * f_hand + tl.minimum(channel, FUSED - 1) * f_channel, x_at, y_at, width,
+                    f_row, f_column)
+    factors = tl.load(weight[None, :] + (channel * OUTPUTS)[:, None], mask=(channel < FUSED)[:, None], other=0)
+    total += tl.sum(local[:, None] * factors.to(tl.float32), axis=0)
+    weight += FUSED * OUTPUTS
+    local = _sample(finest + tl.program_id(0) * s_hand + tl.minimum(channel, FINEST - 1) * s_channel, x_at, y_at, width,
+                    s_row, s_column)
+    factors = tl.load(weight[None, :] + (channel * OUTPUTS)[:, None], mask=(channel < FINEST)[:, None], other=0)
+    total += tl.sum(local[:, None] * factors.to(tl.float32), axis=0)
+    weight += FINEST * OUTPUTS
+    for axis in tl.static_range(3):
+        total += tl.load(joints + which * 3 + axis) * tl.load(weight + axis * OUTPUTS).to(tl.float32)
+        total += tl.load(votes + which * 3 + axis) * tl.load(weight + (3 + axis) * OUTPUTS).to(tl.float32)
+    total += tl.load(confidence + which) * tl.load(weight + 6 * OUTPUTS).to(tl.float32)
+    tl.store(y + which * OUTPUTS + output, tl.where(total < 0, total * LEAK, total))
+
+
+@triton.jit
+def _sample(at, x, y, width, s_row, s_column):
+    """Bilinear, as `grid_sample` does it, with zeros outside."""
+    left, top = tl.floor(x), tl.floor(y)
+    right, low = x - left, y - top
+    column, row = left.to(tl.int32), top.to(tl.int32)
+    above = _between(_pixel(at, row, column, width, s_row, s_column),
+                     _pixel(at, row, column + 1, width, s_row, s_column), right)
+    below = _between(_pixel(at, row + 1, column, width, s_row, s_column),
+                     _pixel(at, row + 1, column + 1, width, s_row, s_column), right)
+    return _between(above, below, low)
+
+
+@triton.jit
+def _pixel(at, row, column, width, s_row, s_column):
+    there = (row >= 0) & (row < width) & (column >= 0) & (column < width)
+    at += tl.minimum(tl.maximum(row, 0), width - 1) * s_row + tl.minimum(tl.maximum(column, 0), width - 1) * s_column
+    return tl.where(there, tl.load(at).to(tl.float32), 0)
+
+
+@triton.jit
+def _copy(x, y, count, BLOCK: tl.constexpr):
+    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    tl.store(y + at, tl.load(x + at, mask=at < count), mask=at < count)
+
+
 COMPILED = isinstance(_cut, triton.JITFunction)
 """Whether kernels are compiled. With TRITON_INTERPRET=1 they are interpreted on the CPU."""
 
 
 def fits(layer: nn.Conv2d, pool: int) -> bool:
-    """Whether `convolve` can compute this layer, and is worth using: few filters in a group. Tensor cores need many.
+    """Whether `convolve` can compute this layer."""
+    return (layer.kernel_size[0] == layer.kernel_size[1] and layer.stride[0] == layer.stride[1]
+            and isinstance(layer.padding, tuple) and layer.padding[0] == layer.padding[1]
+            and layer.padding_mode == 'zeros' and layer.dilation == (1, 1) and layer.bias is not None
+            and pool in (1, 2, 4))
+
+
+def gains(layer: nn.Conv2d, hands: int) -> bool:
+    """Whether `convolve` is faster than PyTorch: for few hands, and for few filters."""
+    return hands <= HANDS or layer.out_channels // layer.groups <= FEW
+
+
+def convolve(x: Tensor, layer: nn.Conv2d, pool: int = 1, relu: bool = True, added: Tensor | None = None,
+             planes: bool = False) -> Tensor:
+    """A convolution, an addition, max-pooling and ReLU: (N, C, H, W) -> (N, F, H', W').
+
+    Args:
+        added: (N, F, H', W'), or smaller: it is enlarged then. Not with pooling.
+        planes: the answer is float32, and its pixels lie side by side. Otherwise it has the precision of the weights,
+            and its channels lie side by side if there are more than FEW.
     """
-    each = layer.out_channels // layer.groups
-    return (layer.padding == (0, 0) and layer.stride == (1, 1) and layer.dilation == (1, 1) and layer.bias is not None
-            and layer.kernel_size[0] == layer.kernel_size[1] and each in (4, 8, 16) and pool in (1, 2, 4))
-
-
-def convolve(x: Tensor, layer: nn.Conv2d, pool: int) -> Tensor:
-    """Convolution, max-pooling and ReLU: (N, C, H, W) -> (N, F, (H - K + 1) // pool, (W - K + 1) // pool)."""
-    x = x.contiguous()
     hands, _, height, width = x.shape
     filters, inputs, size, _ = layer.weight.shape
-    rows, columns = ((side - size + 1) // pool for side in (height, width))
-    y = x.new_empty(hands, filters, rows, columns)
-    each = filters // layer.groups
-    values = _LARGE if y.numel() * pool * pool >= _LARGE * _PROGRAMS else _SMALL
-    cells = max(1, values // (each * pool * pool))
-    _convolve[(hands * layer.groups, triton.cdiv(rows * columns, cells))](
-        x, layer.weight, layer.bias, y, layer.groups, height, width, rows, columns, *layer.weight.stride(),
-        INPUTS=inputs, FILTERS=each, SIZE=size, POOL=pool, CELLS=cells)
+    stride, padding, each, taps = layer.stride[0], int(layer.padding[0]), filters // layer.groups, inputs * size * size
+    rows, columns = (((side + 2 * padding - size) // stride + 1) // pool for side in (height, width))
+    planar = planes or each <= FEW
+    y = torch.empty((hands, filters, rows, columns), device=x.device,
+                    dtype=torch.float32 if planes else layer.weight.dtype,
+                    memory_format=torch.contiguous_format if planar else torch.channels_last)
+    added_or_none = y if added is None else added
+    # The fastest of some twenty ways, for the layers of our networks on an H100: many small programs, of which each
+    # sums long sums in four parts at a time. Many hands need no further division.
+    places, parts = (64, 1) if hands > HANDS else (16, 4 if taps > 64 else 1)
+    step = 32 if taps > 64 else max(16, triton.next_power_of_2(taps))
+    tile = min(16, max(8, triton.next_power_of_2(each)))
+    _convolve[hands * layer.groups, triton.cdiv(rows * columns * pool * pool, places), triton.cdiv(each, tile)](
+        x, layer.weight, layer.bias, added_or_none, y, layer.groups, height, width, rows, columns,
+        *x.stride(), *layer.weight.stride(), *added_or_none.stride(), *y.stride(),
+        INPUTS=inputs, FILTERS=each, SIZE=size, STRIDE=stride, PADDING=padding, POOL=pool, RELU=relu,
+        ENLARGED=0 if added is None else rows // added.shape[2], PLACES=places, TILE=tile, PARTS=parts, STEP=step,
+        num_warps=2 if hands > HANDS or taps <= 32 else 4)
     return y
 
 
-def linear(x: Tensor, weight: Tensor, bias: Tensor, relu: bool) -> Tensor:
-    """x (N, I), weight (O, I) and bias (O,) -> (N, O), with ReLU if `relu`."""
-    x = x.contiguous()
+def linear(x: Tensor, weight: Tensor, bias: Tensor, slope: float = 1.0, added: Tensor | None = None) -> Tensor:
+    """x (N, I), weight (O, I) and bias (O,) -> (N, O) float32. `added` (N, O) is added at the end.
+
+    Args:
+        slope: negative values are multiplied by it. 0 is ReLU.
+    """
     outputs, inputs = weight.shape
-    y, each = x.new_empty(len(x), outputs), 4
-    _linear[(len(x), triton.cdiv(outputs, each))](x, weight, bias, y, inputs, outputs, RELU=relu, OUTPUTS=each,
-                                                  BLOCK=min(512, triton.next_power_of_2(inputs)))
+    y, each = torch.empty(len(x), outputs, device=x.device), 4
+    _linear[(len(x), triton.cdiv(outputs, each))](
+        x.contiguous(), weight, bias, y if added is None else added.contiguous(), y, inputs, outputs, slope,
+        ADDED=added is not None, OUTPUTS=each, BLOCK=min(512, triton.next_power_of_2(inputs)))
     return y
 
 
@@ -149,3 +348,60 @@ def cut(image: Tensor, joints: Tensor, region: Region) -> Tensor:
         image.contiguous(), joints.float().contiguous(), windows, count, PATCH_SIZE // region.shrink, image.shape[-1],
         region.width / PATCH_SIZE, CELLS=cells, LINES=lines)
     return windows
+
+
+def cells(patch: Tensor) -> tuple[Tensor, Tensor]:
+    """As `models.dense.cells`. The answer is float32."""
+    hands = len(patch)
+    positions, seen = (patch.new_empty(hands, n, CELLS, CELLS, dtype=torch.float32) for n in (3, 1))
+    _cells[(hands, CELLS)](patch.contiguous(), positions, seen, WIDTH=CELLS, SIZE=PATCH_SIZE // CELLS)
+    return positions, seen
+
+
+def decode(positions: Tensor, seen: Tensor, directions: Tensor, closeness: Tensor) -> tuple[Tensor, Tensor]:
+    """As `models.dense.decode`. The maps of one hand must lie side by side."""
+    hands, count = closeness.shape[:2]
+    joints, agreement = positions.new_empty(hands, count, 3), positions.new_empty(hands, count)
+    _decode[(hands, count)](positions, seen, directions, closeness, joints, agreement, count,
+                            directions.stride(0), closeness.stride(0), ALL=CELLS * CELLS, SHARPNESS=SHARPNESS,
+                            REACH=REACH)
+    return joints, agreement
+
+
+def seen(network: TwoLooks, patch: Tensor, joints: Tensor, size: Tensor) -> tuple[View, Tensor]:
+    """As `TwoLooks.seen`."""
+    hands, count, _ = joints.shape
+    middle, turn, scale = (torch.empty(hands, *shape, device=patch.device) for shape in ((3,), (2, 2), ()))
+    patches, lines = torch.empty_like(patch), 8
+    _look[(hands, PATCH_SIZE // lines)](
+        patch.contiguous(), joints.float().contiguous(), size.float().contiguous(), middle, turn, scale, patches,
+        count, network.root, KNUCKLES=sum(1 << k for k in network.knuckles),
+        ONE=1 / len(network.knuckles), MOST=triton.next_power_of_2(count), WIDTH=PATCH_SIZE,
+        LINES=lines, ZOOM=ZOOM, MAX_SIZE=MAX_SIZE, STEPS=STEPS)
+    return View(middle, turn, scale), patches
+
+
+def read(joints: Tensor, votes: Tensor, confidence: Tensor, local: Sequence[Tensor], weight: Tensor,
+         bias: Tensor) -> Tensor:
+    """What is seen at joints and known of them, times a weight for each joint: the first layer of `JointRefinement`.
+
+    Args:
+        joints, votes, confidence, local: see `JointRefinement.forward`. Two maps of the same size.
+        weight: (J, I, O), with the norm merged.
+        bias: (J, 1, O)
+
+    Returns:
+        (B, J, O) float32.
+    """
+    (hands, count, _), (fused, finest), outputs = joints.shape, local, weight.shape[2]
+    y = joints.new_empty(hands, count, outputs, dtype=torch.float32)
+    _read[(hands, count)](
+        *(part.float().contiguous() for part in (joints, votes, confidence)), fused, finest, weight, bias, y, count,
+        fused.shape[3], *fused.stride(), *finest.stride(), FUSED=fused.shape[1], FINEST=finest.shape[1],
+        BLOCK=triton.next_power_of_2(max(fused.shape[1], finest.shape[1])), OUTPUTS=outputs, LEAK=LEAK)
+    return y
+
+
+def copy(source: Tensor, target: Tensor) -> None:
+    """Copy between pinned memory and the GPU, for little data: PyTorch's copy takes five microseconds to start."""
+    _copy[(triton.cdiv(source.numel(), 1024),)](source.contiguous(), target, source.numel(), BLOCK=1024)

@@ -122,8 +122,8 @@ class SecondLookObjective(DenseObjective):
     network: TwoLooks
 
     def forward(self, batch: Batch) -> Terms:
-        view = self.network.view(batch['patch'])
-        out = self.network.second.forward_full(view.patch(batch['patch']))
+        view, seen = self.network.look(batch['patch'])
+        out = self.network.second.forward_full(seen)
         return self._terms(out, batch, view.into(batch['joints']), view.scale)
 
     def poses(self, batch: Batch) -> Tensor:

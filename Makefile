@@ -20,7 +20,7 @@ $(STAMP): Makefile pyproject.toml setup.py CMakeLists.txt package.xml $(wildcard
 	@$(PYTHON) -c 'import sys, venv; sys.exit(None if sys.version_info >= (3, 10) else "Python >= 3.10 is needed: make PYTHON=...")'
 	@command -v c++ > /dev/null || { echo 'A C++ compiler is needed to build the messages (Debian, Ubuntu: apt install g++).'; exit 1; }
 	$(VENV)/bin/python -m pip --version > /dev/null 2>&1 || $(PYTHON) -m venv $(VENV)
-	@echo 'Installing into $(VENV): 2 GB (6 with CUDA) and some minutes, once ...'
+	@echo 'Installing into $(VENV): 3 GB (6 with CUDA) and some minutes, once ...'
 	$(VENV)/bin/python -m pip install --quiet '$(TORCH)' --editable '.[ros,messages,train,docs,test]'
 	$(VENV)/bin/python -c 'import hand_pose_ros.msg'
 	@touch $@

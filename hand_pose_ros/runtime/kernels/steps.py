@@ -1,9 +1,4 @@
-"""GPU kernels of our own (in Triton). Each does in one kernel what PyTorch does for small layers in three to forty.
-
-For few hands, the number of kernels decides the time, at one and a half to five microseconds each; what they compute
-hardly matters. There are: a convolution with what follows it, a linear layer with what follows it, the cut around a
-joint of the refiner, and four steps of `models.dense` and `models.two_looks`. All compute in float32.
-"""
+"""Steps of `models.refiner`, `models.dense` and `models.two_looks`, and a copy."""
 
 # Functions that Triton compiles take pointers and numbers of Triton's types.
 # mypy: disable-error-code="no-untyped-def"
@@ -15,88 +10,12 @@ from collections.abc import Sequence
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor, nn
+from torch import Tensor
 
 from hand_pose_ros.geometry import PATCH_SIZE
 from hand_pose_ros.models.dense import CELLS, LEAK, REACH, SHARPNESS
 from hand_pose_ros.models.refiner import Region
 from hand_pose_ros.models.two_looks import MAX_SIZE, STEPS, ZOOM, TwoLooks, View
-
-HANDS = 16
-"""With more hands at a time, PyTorch is faster for most layers."""
-FEW = 8
-"""With so few filters, tensor cores would idle in PyTorch's convolutions."""
-
-
-@triton.jit
-def _convolve(x, weight, bias, added, y, groups, height, width, rows, columns,
-              x_hand, x_channel, x_row, x_column, w_filter, w_channel, w_row, w_column,
-              a_hand, a_channel, a_row, a_column, y_hand, y_channel, y_row, y_column,
-              INPUTS: tl.constexpr, FILTERS: tl.constexpr, SIZE: tl.constexpr, STRIDE: tl.constexpr,
-              PADDING: tl.constexpr, POOL: tl.constexpr, RELU: tl.constexpr, ENLARGED: tl.constexpr,
-              PLACES: tl.constexpr, TILE: tl.constexpr, PARTS: tl.constexpr, STEP: tl.constexpr):
-    """TILE filters of one group at PLACES of one image: a matrix product over channels and taps, in PARTS at a time.
-
-    Places that are pooled are neighbours. What is added is enlarged by ENLARGED; 0 = nothing is added.
-    """
-    hand, group = (tl.program_id(0) // groups).to(tl.int64), tl.program_id(0) % groups
-    place = tl.program_id(1) * PLACES + tl.arange(0, PLACES)
-    cell, pooled = place // (POOL * POOL), place % (POOL * POOL)
-    inside = (cell < rows * columns)[None, :, None]
-    top = ((cell // columns * POOL + pooled // POOL) * STRIDE - PADDING)[None, :, None]
-    left = ((cell % columns * POOL + pooled % POOL) * STRIDE - PADDING)[None, :, None]
-    number = tl.program_id(2) * TILE + tl.arange(0, TILE)
-    wanted = number < FILTERS
-    x += hand * x_hand + group * INPUTS * x_channel
-    weight += (group * FILTERS + number)[None, None, :] * w_filter
-    total = tl.zeros((PARTS, PLACES, TILE), tl.float32)
-    for start in range(0, INPUTS * SIZE * SIZE, PARTS * STEP):
-        k = start + tl.arange(0, PARTS)[:, None] * STEP + tl.arange(0, STEP)[None, :]
-        used = k < INPUTS * SIZE * SIZE
-        channel, i, j = k % INPUTS, k // INPUTS // SIZE, k // INPUTS % SIZE
-        row, column = top + i[:, None, :], left + j[:, None, :]
-        there = inside & used[:, None, :] & (row >= 0) & (row < height) & (column >= 0) & (column < width)
-        pixels = tl.load(x + row * x_row + column * x_column + channel[:, None, :] * x_channel, mask=there, other=0)
-        taps = tl.load(weight + (channel * w_channel + i * w_row + j * w_column)[:, :, None],
-                       mask=used[:, :, None] & wanted[None, None, :], other=0)
-        # Tensor cores compute float32 from three products, to nearly all of its digits.
-        total = tl.dot(pixels.to(taps.dtype), taps, total, input_precision='tf32x3')
-    total = tl.sum(total, axis=0)
-    WINDOWS: tl.constexpr = PLACES // (POOL * POOL)
-    if POOL > 1:
-        total = tl.max(tl.reshape(total, (WINDOWS, POOL * POOL, TILE)), axis=1)
-    cell = tl.program_id(1) * WINDOWS + tl.arange(0, WINDOWS)
-    kept = (cell < rows * columns)[:, None] & wanted[None, :]
-    row, column, filters = (cell // columns)[:, None], (cell % columns)[:, None], (group * FILTERS + number)[None, :]
-    total += tl.load(bias + filters, mask=wanted[None, :], other=0).to(tl.float32)
-    if ENLARGED > 0:
-        total += tl.load(added + hand * a_hand + filters * a_channel + row // ENLARGED * a_row
-                         + column // ENLARGED * a_column, mask=kept, other=0).to(tl.float32)
-    if RELU:
-        total = tl.maximum(total, 0)
-    tl.store(y + hand * y_hand + filters * y_channel + row * y_row + column * y_column,
-             total.to(y.dtype.element_ty), mask=kept)
-
-
-@triton.jit
-def _linear(x, weight, bias, added, y, inputs, outputs, slope,
-            ADDED: tl.constexpr, OUTPUTS: tl.constexpr, BLOCK: tl.constexpr):
-    """OUTPUTS values for one hand."""
-    hand = tl.program_id(0)
-    number = tl.program_id(1) * OUTPUTS + tl.arange(0, OUTPUTS)
-    within = number < outputs
-    total = tl.zeros((OUTPUTS, BLOCK), tl.float32)
-    for start in range(0, inputs, BLOCK):
-        at = start + tl.arange(0, BLOCK)
-        values = tl.load(x + hand * inputs + at, mask=at < inputs, other=0)
-        factors = tl.load(weight + number[:, None] * inputs + at[None, :],
-                          mask=within[:, None] & (at < inputs)[None, :], other=0)
-        total += values.to(tl.float32)[None, :] * factors.to(tl.float32)
-    answer = tl.sum(total, axis=1) + tl.load(bias + number, mask=within, other=0).to(tl.float32)
-    answer = tl.where(answer < 0, answer * slope, answer)
-    if ADDED:
-        answer += tl.load(added + hand * outputs + number, mask=within, other=0).to(tl.float32)
-    tl.store(y + hand * outputs + number, answer.to(y.dtype.element_ty), mask=within)
 
 
 @triton.jit
@@ -130,6 +49,16 @@ def _between(first, second, fraction):
     return first + (second - first) * fraction
 
 
+def cut(image: Tensor, joints: Tensor, region: Region) -> Tensor:
+    """As `models.refiner.cut`, for regions whose window width is a power of two."""
+    cells, lines, (hands, count, _) = region.width // region.shrink, 8, joints.shape
+    windows = image.new_empty(hands, count, cells, cells)
+    _cut[(hands * count, cells // lines)](
+        image.contiguous(), joints.float().contiguous(), windows, count, PATCH_SIZE // region.shrink, image.shape[-1],
+        region.width / PATCH_SIZE, CELLS=cells, LINES=lines)
+    return windows
+
+
 @triton.jit
 def _cells(patch, positions, seen, WIDTH: tl.constexpr, SIZE: tl.constexpr):
     """One row of the cells of one hand, as in `models.dense.cells`."""
@@ -149,6 +78,14 @@ def _cells(patch, positions, seen, WIDTH: tl.constexpr, SIZE: tl.constexpr):
     tl.store(seen + hand * WIDTH * WIDTH + cell, (count > 0).to(tl.float32))
 
 
+def cells(patch: Tensor) -> tuple[Tensor, Tensor]:
+    """As `models.dense.cells`. The answer is float32."""
+    hands = len(patch)
+    positions, seen = (patch.new_empty(hands, n, CELLS, CELLS, dtype=torch.float32) for n in (3, 1))
+    _cells[(hands, CELLS)](patch.contiguous(), positions, seen, WIDTH=CELLS, SIZE=PATCH_SIZE // CELLS)
+    return positions, seen
+
+
 @triton.jit
 def _decode(positions, seen, directions, closeness, joints, agreement, count, d_hand, c_hand,
             ALL: tl.constexpr, SHARPNESS: tl.constexpr, REACH: tl.constexpr):
@@ -165,6 +102,16 @@ def _decode(positions, seen, directions, closeness, joints, agreement, count, d_
         direction = tl.load(directions + hand * d_hand + (joint * 3 + axis) * ALL + cell)
         tl.store(joints + axis, tl.sum(weight * (place + direction * distance), axis=0))
     tl.store(agreement + hand * count + joint, tl.sum(weight * close, axis=0))
+
+
+def decode(positions: Tensor, seen: Tensor, directions: Tensor, closeness: Tensor) -> tuple[Tensor, Tensor]:
+    """As `models.dense.decode`. The maps of one hand must lie side by side."""
+    hands, count = closeness.shape[:2]
+    joints, agreement = positions.new_empty(hands, count, 3), positions.new_empty(hands, count)
+    _decode[(hands, count)](positions, seen, directions, closeness, joints, agreement, count,
+                            directions.stride(0), closeness.stride(0), ALL=CELLS * CELLS, SHARPNESS=SHARPNESS,
+                            REACH=REACH)
+    return joints, agreement
 
 
 @triton.jit
@@ -222,6 +169,19 @@ def _rounded(x, steps):
     return tl.floor(x * steps + 0.5) / steps
 
 
+def seen(network: TwoLooks, patch: Tensor, joints: Tensor, size: Tensor) -> tuple[View, Tensor]:
+    """As `TwoLooks.seen`."""
+    hands, count, _ = joints.shape
+    middle, turn, scale = (torch.empty(hands, *shape, device=patch.device) for shape in ((3,), (2, 2), ()))
+    patches, lines = torch.empty_like(patch), 8
+    _look[(hands, PATCH_SIZE // lines)](
+        patch.contiguous(), joints.float().contiguous(), size.float().contiguous(), middle, turn, scale, patches,
+        count, network.root, KNUCKLES=sum(1 << k for k in network.knuckles),
+        ONE=1 / len(network.knuckles), MOST=triton.next_power_of_2(count), WIDTH=PATCH_SIZE,
+        LINES=lines, ZOOM=ZOOM, MAX_SIZE=MAX_SIZE, STEPS=STEPS)
+    return View(middle, turn, scale), patches
+
+
 @triton.jit
 def _read(joints, votes, confidence, fused, finest, weight, bias, y, count, width,
           f_hand, f_channel, f_row, f_column, s_hand, s_channel, s_row, s_column,
@@ -271,116 +231,6 @@ def _pixel(at, row, column, width, s_row, s_column):
     return tl.where(there, tl.load(at).to(tl.float32), 0)
 
 
-@triton.jit
-def _copy(x, y, count, BLOCK: tl.constexpr):
-    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    tl.store(y + at, tl.load(x + at, mask=at < count), mask=at < count)
-
-
-COMPILED = isinstance(_cut, triton.JITFunction)
-"""Whether kernels are compiled. With TRITON_INTERPRET=1 they are interpreted on the CPU."""
-
-
-def fits(layer: nn.Conv2d, pool: int) -> bool:
-    """Whether `convolve` can compute this layer."""
-    return (layer.kernel_size[0] == layer.kernel_size[1] and layer.stride[0] == layer.stride[1]
-            and isinstance(layer.padding, tuple) and layer.padding[0] == layer.padding[1]
-            and layer.padding_mode == 'zeros' and layer.dilation == (1, 1) and layer.bias is not None
-            and pool in (1, 2, 4))
-
-
-def gains(layer: nn.Conv2d, hands: int) -> bool:
-    """Whether `convolve` is faster than PyTorch: for few hands, and for few filters."""
-    return hands <= HANDS or layer.out_channels // layer.groups <= FEW
-
-
-def convolve(x: Tensor, layer: nn.Conv2d, pool: int = 1, relu: bool = True, added: Tensor | None = None,
-             planes: bool = False) -> Tensor:
-    """A convolution, an addition, max-pooling and ReLU: (N, C, H, W) -> (N, F, H', W').
-
-    Args:
-        added: (N, F, H', W'), or smaller: it is enlarged then. Not with pooling.
-        planes: the answer is float32, and its pixels lie side by side. Otherwise it has the precision of the weights,
-            and its channels lie side by side if there are more than FEW.
-    """
-    hands, _, height, width = x.shape
-    filters, inputs, size, _ = layer.weight.shape
-    stride, padding, each, taps = layer.stride[0], int(layer.padding[0]), filters // layer.groups, inputs * size * size
-    rows, columns = (((side + 2 * padding - size) // stride + 1) // pool for side in (height, width))
-    planar = planes or each <= FEW
-    y = torch.empty((hands, filters, rows, columns), device=x.device,
-                    dtype=torch.float32 if planes else layer.weight.dtype,
-                    memory_format=torch.contiguous_format if planar else torch.channels_last)
-    added_or_none = y if added is None else added
-    # The fastest of some twenty ways, for the layers of our networks on an H100: many small programs, of which each
-    # sums long sums in four parts at a time. Many hands need no further division.
-    places, parts = (64, 1) if hands > HANDS else (16, 4 if taps > 64 else 1)
-    step = 32 if taps > 64 else max(16, triton.next_power_of_2(taps))
-    tile = min(16, max(8, triton.next_power_of_2(each)))
-    _convolve[hands * layer.groups, triton.cdiv(rows * columns * pool * pool, places), triton.cdiv(each, tile)](
-        x, layer.weight, layer.bias, added_or_none, y, layer.groups, height, width, rows, columns,
-        *x.stride(), *layer.weight.stride(), *added_or_none.stride(), *y.stride(),
-        INPUTS=inputs, FILTERS=each, SIZE=size, STRIDE=stride, PADDING=padding, POOL=pool, RELU=relu,
-        ENLARGED=0 if added is None else rows // added.shape[2], PLACES=places, TILE=tile, PARTS=parts, STEP=step,
-        num_warps=2 if hands > HANDS or taps <= 32 else 4)
-    return y
-
-
-def linear(x: Tensor, weight: Tensor, bias: Tensor, slope: float = 1.0, added: Tensor | None = None) -> Tensor:
-    """x (N, I), weight (O, I) and bias (O,) -> (N, O) float32. `added` (N, O) is added at the end.
-
-    Args:
-        slope: negative values are multiplied by it. 0 is ReLU.
-    """
-    outputs, inputs = weight.shape
-    y, each = torch.empty(len(x), outputs, device=x.device), 4
-    _linear[(len(x), triton.cdiv(outputs, each))](
-        x.contiguous(), weight, bias, y if added is None else added.contiguous(), y, inputs, outputs, slope,
-        ADDED=added is not None, OUTPUTS=each, BLOCK=min(512, triton.next_power_of_2(inputs)))
-    return y
-
-
-def cut(image: Tensor, joints: Tensor, region: Region) -> Tensor:
-    """As `models.refiner.cut`, for regions whose window width is a power of two."""
-    cells, lines, (hands, count, _) = region.width // region.shrink, 8, joints.shape
-    windows = image.new_empty(hands, count, cells, cells)
-    _cut[(hands * count, cells // lines)](
-        image.contiguous(), joints.float().contiguous(), windows, count, PATCH_SIZE // region.shrink, image.shape[-1],
-        region.width / PATCH_SIZE, CELLS=cells, LINES=lines)
-    return windows
-
-
-def cells(patch: Tensor) -> tuple[Tensor, Tensor]:
-    """As `models.dense.cells`. The answer is float32."""
-    hands = len(patch)
-    positions, seen = (patch.new_empty(hands, n, CELLS, CELLS, dtype=torch.float32) for n in (3, 1))
-    _cells[(hands, CELLS)](patch.contiguous(), positions, seen, WIDTH=CELLS, SIZE=PATCH_SIZE // CELLS)
-    return positions, seen
-
-
-def decode(positions: Tensor, seen: Tensor, directions: Tensor, closeness: Tensor) -> tuple[Tensor, Tensor]:
-    """As `models.dense.decode`. The maps of one hand must lie side by side."""
-    hands, count = closeness.shape[:2]
-    joints, agreement = positions.new_empty(hands, count, 3), positions.new_empty(hands, count)
-    _decode[(hands, count)](positions, seen, directions, closeness, joints, agreement, count,
-                            directions.stride(0), closeness.stride(0), ALL=CELLS * CELLS, SHARPNESS=SHARPNESS,
-                            REACH=REACH)
-    return joints, agreement
-
-
-def seen(network: TwoLooks, patch: Tensor, joints: Tensor, size: Tensor) -> tuple[View, Tensor]:
-    """As `TwoLooks.seen`."""
-    hands, count, _ = joints.shape
-    middle, turn, scale = (torch.empty(hands, *shape, device=patch.device) for shape in ((3,), (2, 2), ()))
-    patches, lines = torch.empty_like(patch), 8
-    _look[(hands, PATCH_SIZE // lines)](
-        patch.contiguous(), joints.float().contiguous(), size.float().contiguous(), middle, turn, scale, patches,
-        count, network.root, KNUCKLES=sum(1 << k for k in network.knuckles),
-        ONE=1 / len(network.knuckles), MOST=triton.next_power_of_2(count), WIDTH=PATCH_SIZE,
-        LINES=lines, ZOOM=ZOOM, MAX_SIZE=MAX_SIZE, STEPS=STEPS)
-    return View(middle, turn, scale), patches
-
-
 def read(joints: Tensor, votes: Tensor, confidence: Tensor, local: Sequence[Tensor], weight: Tensor,
          bias: Tensor) -> Tensor:
     """What is seen at joints and known of them, times a weight for each joint: the first layer of `JointRefinement`.
@@ -400,6 +250,12 @@ def read(joints: Tensor, votes: Tensor, confidence: Tensor, local: Sequence[Tens
         fused.shape[3], *fused.stride(), *finest.stride(), FUSED=fused.shape[1], FINEST=finest.shape[1],
         BLOCK=triton.next_power_of_2(max(fused.shape[1], finest.shape[1])), OUTPUTS=outputs, LEAK=LEAK)
     return y
+
+
+@triton.jit
+def _copy(x, y, count, BLOCK: tl.constexpr):
+    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    tl.store(y + at, tl.load(x + at, mask=at < count), mask=at < count)
 
 
 def copy(source: Tensor, target: Tensor) -> None:

@@ -55,8 +55,7 @@ def test_the_list_of_verbs_is_complete(capsys):
                                        ['train', 'modern', '--out', 'x', '--workers', '-1'],
                                        ['synth', 'show', 'x.png', '--split', 'val', '--start', '-1'],
                                        ['estimate', 'x', '--no-such-option'], ['evaluate'],
-                                       ['evaluate', 'a.mcap', '--side', 'up'], ['train', 'modern'],
-                                       ['evaluate', 'a.mcap', 'a.mcap']])
+                                       ['evaluate', 'a.mcap', '--side', 'up'], ['train', 'modern']])
 def test_bad_arguments_are_exit_code_2_and_one_sentence(arguments, capsys):
     with pytest.raises(SystemExit) as exit_:
         main(arguments)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
@@ -95,8 +96,12 @@ def run(args: argparse.Namespace) -> int:
     """Evaluate, write the outputs and print the numbers. Returns 1 if a bag failed or is damaged."""
     if bool(args.bags) == bool(args.predictions):
         args.parser.error('give either bags or --predictions')
-    if twice := [bag for bag in args.bags if args.bags.count(bag) > 1]:  # both would write the same files
-        args.parser.error(f'{twice[0]} is given twice: give it once')
+    places: dict[str, str] = {}
+    for bag in args.bags:
+        place = os.path.realpath(bag)
+        if place in places:  # both would write the same files
+            args.parser.error(f'{places[place]} and {bag} are the same bag: give it once')
+        places[place] = bag
     if args.out and len(args.bags) < 2 and Path(args.out).suffix != '.npz':
         args.parser.error(f'--out {args.out}: the result is an .npz file')
     out = Path(args.out) / 'any.npz' if args.out and len(args.bags) > 1 else args.out

@@ -159,6 +159,14 @@ def test_report_of_nothing_found_can_be_written(result, tmp_path):
     assert legends(plots.curves([nothing])) == [' n   AUC 0.000, mean -']
 
 
+def test_report_of_no_frames_can_be_written(result, tmp_path):
+    none = replace(result, predictions=result.predictions[:0], truth=result.truth[:0], stamps_ns=result.stamps_ns[:0],
+                   seconds={stage: seconds[:0] for stage, seconds in result.seconds.items()})
+    for one in none, replace(none, truth=None):
+        page = write_report([one], tmp_path).read_text()
+        assert '0 frames' in page and '<td>nan</td>' not in page
+
+
 def test_curves_show_what_the_metrics_say(result):
     left, right = plots.curves([result]).axes
     for axes, curve in ((left, metrics.success_curve), (right, metrics.pck)):

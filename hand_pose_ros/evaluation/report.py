@@ -171,7 +171,7 @@ def _figures(scored: Sequence[Result], result: Result) -> dict[str, Figure]:
         figures = {'curves': plots.curves(scored), 'joints': plots.joint_bars(scored)}
     if np.isfinite(metrics.frame_means_mm(result.errors_mm)).sum() > 1:
         figures['errors'] = plots.over_time(result)
-    if result.seconds:
+    if result.seconds and len(result.predictions):
         figures['latency'] = plots.latency(result)
     return figures
 

@@ -42,6 +42,9 @@ def test_experiments_train_what_is_missing_and_write_table_plot_and_json(folder,
         assert json.loads((tmp_path / f'{name}.json').read_text())['recipe']['samples'] == 24
         assert cv2.imread(str(tmp_path / f'{name}.png')).std() > 5
         assert (tmp_path / f'{name}.md').read_text().count('|') > 20
+    assert {path.name for path in tmp_path.iterdir()} == {'runs', *(
+        f'{name}.{form}' for name in ('bottleneck', 'bottleneck-curves', 'refinement', 'refinement-curves', 'joints',
+                                      'qualitative', 'runtime') for form in ('json', 'md', 'png', 'svg'))}
     runs = {path.name: (path / 'state.safetensors').stat().st_mtime_ns for path in (tmp_path / 'runs').iterdir()}
     assert runs.keys() == {'deep-direct', 'deep-8', 'deep-30', 'deep-30-std_ref', 'deep-30-or_ref'}
     assert load_checkpoint(tmp_path / 'runs' / 'deep-8' / 'last.safetensors').network.config == {

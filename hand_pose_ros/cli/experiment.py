@@ -20,8 +20,9 @@ EXAMPLES = """experiments:
   qualitative   estimates and truth on depth and on the point cloud from the side
   ingredients   (ours) what each ingredient of the synthetic hands is worth: trained without it, tested with all
 
-Each writes NAME.json, NAME.md, NAME.png and NAME.svg. Networks are trained with equal budgets into OUT/runs and shared
-by all experiments in OUT. An interrupted training continues.
+Each writes NAME.json, NAME.md, NAME.png and NAME.svg; bottleneck and refinement also write their curves, as
+NAME-curves.*. Networks are trained with equal budgets into OUT/runs and shared by all experiments in OUT. An
+interrupted training continues.
 
 examples:
   hand-pose experiment bottleneck --out results --set samples=300_000

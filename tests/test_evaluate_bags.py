@@ -113,6 +113,16 @@ def test_another_hand_is_no_jitter(tmp_path, settings, result):
         assert all(told[name] < mixed[name] / 2 for name in ('error_jitter_mm', 'jitter_mm') if name in told)
 
 
+def test_images_that_are_missing_are_no_jitter(result):
+    moving = np.full((FRAMES, 21, 3), 0.5)
+    moving[FRAMES // 2:] += 0.2  # so far has the hand moved, while no image was recorded
+    stamps = result.stamps_ns + np.where(np.arange(FRAMES) < FRAMES // 2, 0, 10**9)
+    blind = replace(result, predictions=moving, stamps_ns=stamps)
+    scored = replace(blind, truth=np.ones_like(moving), parts={'all': (0, FRAMES)}).summary()
+    assert blind.summary()['jitter_mm'] == scored['error_jitter_mm'] == scored['parts']['all']['jitter_mm'] == 0
+    assert replace(blind, stamps_ns=result.stamps_ns).summary()['jitter_mm'] > 10
+
+
 @pytest.mark.parametrize('kind', ['topic', 'npz', 'npz with stamps', 'text'])
 def test_truth_from_a_topic_a_file_or_text_gives_the_same_error(tmp_path, model, result, kind):
     truth = result.predictions + np.array([0.006, 0, 0.008])  # 10 mm off

@@ -139,6 +139,24 @@ def test_jitter_compares_frames_of_one_hand():
     assert np.isnan(metrics.jitter_mm(joints[:1], ['a']))
 
 
+def test_jitter_does_not_cross_a_gap():
+    """Of a hand that moves at one speed, images are missing: it is far away after the gap, and has not shaken."""
+    moving = np.arange(60)[:, None, None] * np.array([0.02, 0, 0]) + np.zeros((1, 21, 1))
+    stamps = np.arange(60) * 33_000_000 + np.random.default_rng(0).integers(-4_000_000, 4_000_000, 60)
+    for missing in ([20], [20, 40], range(20, 40)):
+        joints, left = (np.delete(values, missing, axis=0) for values in (moving, stamps))
+        assert metrics.jitter_mm(joints) > 1
+        assert metrics.jitter_mm(joints, stamps_ns=left) == pytest.approx(0, abs=1e-6)
+        summary = metrics.summarise(joints, np.zeros_like(joints), HAND21, stamps_ns=left)
+        assert summary['jitter_mm'] == summary['error_jitter_mm'] == pytest.approx(0, abs=1e-6)
+    shaken = np.delete(moving, 20, axis=0) + np.random.default_rng(1).normal(0, 0.002, (59, 21, 3))
+    assert metrics.jitter_mm(shaken, stamps_ns=np.delete(stamps, 20)) == pytest.approx(2 * np.sqrt(3), rel=0.1)
+    for same in np.zeros(60, int), np.arange(60):  # no stamps, or another unit: there is no gap
+        assert metrics.jitter_mm(moving + 1, stamps_ns=same) == pytest.approx(0, abs=1e-6)
+    for few in range(3):
+        assert np.isnan(metrics.jitter_mm(moving[:few], stamps_ns=stamps[:few]))
+
+
 def test_bone_drift_of_a_hand_worked_case():
     skeleton = SKELETONS['icvl16']
     joints = np.zeros((2, 16, 3))

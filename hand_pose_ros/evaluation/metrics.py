@@ -20,6 +20,8 @@ from hand_pose_ros.skeleton import FINGERS, Skeleton
 
 Floats = NDArray[np.float64]
 WITHIN_MM = (20, 30, 40, 50, 80)
+GAP = 1.5
+"""A step between two stamps is a gap if it is more than this many times the median step: an image is missing."""
 
 
 def joint_errors_mm(predictions: ArrayLike, truth: ArrayLike) -> Floats:
@@ -147,7 +149,7 @@ def align_rigid(predictions: ArrayLike, truth: ArrayLike) -> Floats:
     return aligned
 
 
-def jitter_mm(joints: ArrayLike, hands: ArrayLike | None = None) -> float:
+def jitter_mm(joints: ArrayLike, hands: ArrayLike | None = None, stamps_ns: ArrayLike | None = None) -> float:
     """How much joints shake around a smooth path. It is the RMS length of the second difference over frames, / sqrt(6).
 
     Uniform motion gives 0. Independent noise with an RMS distance of r gives r, because its second difference has six
@@ -157,11 +159,18 @@ def jitter_mm(joints: ArrayLike, hands: ArrayLike | None = None) -> float:
     Args:
         joints: (N, J, 3) in metres, consecutive frames.
         hands: (N,) name or number of the hand. Only frames of the same hand are compared. None = it is always the same.
+        stamps_ns: (N,) of the frames. No frames are compared across a gap. None = there is no gap.
     """
-    lengths = 1000 * np.linalg.norm(np.diff(np.asarray(joints, np.float64), n=2, axis=0), axis=-1)
+    joints = np.asarray(joints, np.float64)
+    lengths = 1000 * np.linalg.norm(np.diff(joints, n=2, axis=0), axis=-1)
+    follows = np.ones(max(0, len(joints) - 1), bool)  # whether a frame can be compared with the one before it
     if hands is not None:
         hands = np.asarray(hands)
-        lengths = lengths[(hands[:-2] == hands[1:-1]) & (hands[1:-1] == hands[2:])]
+        follows &= hands[1:] == hands[:-1]
+    if stamps_ns is not None and follows.size:
+        steps = np.abs(np.diff(np.asarray(stamps_ns)))
+        follows &= steps <= GAP * np.median(steps)
+    lengths = lengths[follows[1:] & follows[:-1]]
     lengths = lengths[np.isfinite(lengths)]
     return float(np.sqrt((lengths ** 2).mean() / 6)) if lengths.size else float('nan')
 
@@ -238,15 +247,15 @@ def paired_bootstrap(a_mm: ArrayLike, b_mm: ArrayLike, *, block: int = 30, resam
     return float(difference.mean()), float(low), float(high)
 
 
-def summarise(predictions: ArrayLike, truth: ArrayLike, skeleton: Skeleton,
-              hands: ArrayLike | None = None) -> dict[str, Any]:
+def summarise(predictions: ArrayLike, truth: ArrayLike, skeleton: Skeleton, hands: ArrayLike | None = None,
+              stamps_ns: ArrayLike | None = None) -> dict[str, Any]:
     """All numbers of accuracy, by their names in JSON files. NaN becomes None.
 
     Fractions are of labelled frames (`within_mm`, `auc_0_80`) or of labelled joints (`pck_mm`).
 
     Args:
         predictions, truth: (N, J, 3) in metres, for the J joints of the skeleton.
-        hands: see `jitter_mm`.
+        hands, stamps_ns: see `jitter_mm`.
 
     Raises:
         InputError: the shapes differ, or are those of another skeleton.
@@ -270,14 +279,16 @@ def summarise(predictions: ArrayLike, truth: ArrayLike, skeleton: Skeleton,
         'auc_0_80': auc(errors, 80),
         'mean_translation_aligned_mm': mean_mm(joint_errors_mm(align_translation(predictions, truth), truth)),
         'mean_rigid_aligned_mm': mean_mm(joint_errors_mm(align_rigid(predictions, truth), truth)),
-        'error_jitter_mm': jitter_mm(np.asarray(predictions, np.float64) - np.asarray(truth, np.float64), hands),
-        **smoothness(predictions, skeleton, hands),
+        'error_jitter_mm': jitter_mm(np.asarray(predictions, np.float64) - np.asarray(truth, np.float64), hands,
+                                     stamps_ns),
+        **smoothness(predictions, skeleton, hands, stamps_ns),
     })
 
 
-def smoothness(predictions: ArrayLike, skeleton: Skeleton, hands: ArrayLike | None = None) -> dict[str, Any]:
+def smoothness(predictions: ArrayLike, skeleton: Skeleton, hands: ArrayLike | None = None,
+               stamps_ns: ArrayLike | None = None) -> dict[str, Any]:
     """The numbers that need no truth. They are `jitter_mm`, and the mean of `bone_drift_mm` over the bones."""
-    return finite_or_none({'jitter_mm': jitter_mm(predictions, hands),
+    return finite_or_none({'jitter_mm': jitter_mm(predictions, hands, stamps_ns),
                            'bone_drift_mm': mean_mm(bone_drift_mm(predictions, skeleton, hands))})
 
 

@@ -44,7 +44,7 @@ _DEFINITIONS = (
     ('tracks', 'How many hands were tracked. A hand that is lost and found again is a new one.'),
     ('jitter', 'RMS second difference of the error between frames over √6: the size of noise that is independent '
      'from frame to frame. Without truth: of the joints themselves, so that real acceleration counts too. Frames of '
-     'different hands are not compared.'),
+     'different hands are not compared, nor frames between which an image is missing.'),
     ('bone drift', 'Standard deviation of the length of a bone over the frames of one hand, mean of the bones: 0 for a '
      'real hand.'),
 )

@@ -35,7 +35,7 @@ class Result:
         intrinsics: of the depth images.
         predictions: (N, J, 3) in metres, optical frame; NaN = not predicted.
         truth: (N, J, 3) in metres, optical frame; NaN = not labelled. None = no truth.
-        stamps_ns: (N,) stamps of the depth images, or None.
+        stamps_ns: (N,) stamps of the depth images, or None. Jitter is not measured across a gap between them.
         seconds: stage -> its times (N,); NaN = did not run.
         parts: name -> (first row, row after the last), for subjects or sequences that are also reported separately.
         notes: what a reader of the numbers must know.
@@ -70,7 +70,7 @@ class Result:
         detected = np.isfinite(self.predictions).all(-1).any(-1)
         summary: dict[str, Any] = {'name': self.name, 'frames': len(self.predictions)}
         if self.truth is None:
-            summary |= metrics.smoothness(self.predictions, self.skeleton, self._hands())
+            summary |= metrics.smoothness(self.predictions, self.skeleton, self._hands(), self.stamps_ns)
         else:
             summary |= self._accuracy(slice(None))
         summary |= {'frames_total': len(self.predictions),
@@ -97,7 +97,9 @@ class Result:
 
     def _accuracy(self, rows: slice) -> dict[str, Any]:
         assert self.truth is not None
-        summary = metrics.summarise(self.predictions[rows], self.truth[rows], self.skeleton, self._hands()[rows])
+        stamps = None if self.stamps_ns is None else self.stamps_ns[rows]
+        summary = metrics.summarise(self.predictions[rows], self.truth[rows], self.skeleton, self._hands()[rows],
+                                    stamps)
         return summary if self.in_time else summary | dict.fromkeys(metrics.SMOOTHNESS)
 
     def save(self, path: str | Path) -> None:

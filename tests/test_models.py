@@ -193,10 +193,13 @@ def test_mistakes_are_named():
     for name, wrong, wanted in (
             ('blocks', 2, 'whole numbers, for example 1,1,1,1'), ('blocks', (1, 'x', 1, 1), 'whole numbers'),
             ('width', 'x', 'a whole number of at least 1$'), ('width', -8, 'a whole number of at least 1'),
-            ('refined', 'no', 'true or false'), ('bottleneck', 2.5, 'a whole number of at least 0, or none')):
+            ('refined', 'no', 'true or false'), ('bottleneck', 2.5, 'a whole number of at least 1, or none')):
         for architecture in ('hand_dense', 'two_looks'):
             with pytest.raises(HandPoseError, match=f'^{architecture} cannot have {name}=.*: give {wanted}'):
                 build(architecture, **{name: wrong})
+    for architecture in (*POSE_NETWORKS, 'two_looks'):
+        with pytest.raises(HandPoseError, match=f'^{architecture} cannot have bottleneck=0: give .* 1, or none'):
+            build(architecture, bottleneck=0)
     with pytest.raises(HandPoseError, match=r'dropout=2: give a number from 0 to 1'):
         build('deep', dropout=2)
     with pytest.raises(HandPoseError, match='width 1: give at least 2'):

@@ -76,7 +76,7 @@ def _wanted(value: Any, parameter: inspect.Parameter) -> str:
     elif kind == 'float':  # dropout
         fits, wanted = type(value) in (int, float) and 0 <= value <= 1, 'a number from 0 to 1'
     elif kind in ('int', 'int | None'):
-        least, none = min(default or 0, 1), kind != 'int'
+        least, none = int(default != 0), kind != 'int'  # the number of a joint may be 0
         fits = (type(value) is int and value >= least) or (none and value is None)
         wanted = f'a whole number of at least {least}' + ', or none' * none
     elif 'int' in kind:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import atexit
 import logging
+import os
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -66,8 +67,12 @@ def machine(args: argparse.Namespace) -> Machine:
 
 
 def show_progress() -> None:
-    """Print what is logged. A second Ctrl-C, while Python cleans up after the first one, ends the process silently."""
-    logging.basicConfig(level=logging.INFO, format='%(message)s')
+    """Print what is logged; under torchrun, the other processes print only warnings.
+
+    A second Ctrl-C, while Python cleans up after the first one, ends the process silently.
+    """
+    first = os.environ.get('RANK', '0') == '0'
+    logging.basicConfig(level=logging.INFO if first else logging.WARNING, format='%(message)s')
     atexit.register(signal.signal, signal.SIGINT, signal.SIG_DFL)
 
 

@@ -125,6 +125,18 @@ def test_a_reader_that_leaves_early_is_one_sentence():
     assert (done.returncode, done.stderr) == (1, 'hand-pose estimator: standard output: Broken pipe\n')
 
 
+@pytest.mark.parametrize('of_c', [False, True])
+def test_ctrl_c_while_a_verb_is_loaded_is_one_sentence(of_c, monkeypatch, capsys):
+    """Modules in C, as those of ONNX Runtime, make an ImportError of it."""
+    def find_spec(name, *_):
+        if name == 'hand_pose_ros.cli.bench':
+            raise (ImportError('initialization failed') if of_c else KeyboardInterrupt) from KeyboardInterrupt()
+    monkeypatch.setattr(sys, 'meta_path', [SimpleNamespace(find_spec=find_spec), *sys.meta_path])
+    monkeypatch.delitem(sys.modules, 'hand_pose_ros.cli.bench', raising=False)
+    assert main(['bench']) == 1
+    assert capsys.readouterr().err == 'hand-pose bench: interrupted\n'
+
+
 def test_files_are_written_where_the_standard_streams_are_closed(tmp_path):
     command = [sys.executable, '-m', 'hand_pose_ros.cli', 'estimate', str(resource('demo/depth.png')), '--intrinsics',
                '364.5', '364.5', '256', '208', '--out', str(tmp_path / 'hand.npz')]

@@ -15,7 +15,7 @@ import signal
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from hand_pose_ros import __version__
 from hand_pose_ros.errors import HandPoseError
@@ -105,6 +105,38 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb and return the exit code."""
     _open_standard_streams()
     argv = list(sys.argv[1:] if argv is None else argv)
+    name = ' '.join(['hand-pose', *argv[:1]])
+    try:
+        with _ending_like_ctrl_c(), _printing():
+            module, args = _parsed(argv)
+            return module.run(args)
+    except HandPoseError as error:
+        print(f'{name}: {error}', file=sys.stderr)
+        return 1
+    except OSError as error:  # a file that cannot be read or written
+        what = f'{error.filename}: {error.strerror}' if error.filename else str(error)
+        if isinstance(error, FileExistsError | NotADirectoryError):
+            what += ', and a folder is needed: give another name'
+        print(f'{name}: {what}', file=sys.stderr)
+        return 1
+    except RuntimeError as error:
+        if type(error).__name__ != 'OutOfMemoryError':  # of PyTorch, which most verbs need not import
+            raise
+        less = '--device cpu' if argv[0] not in ('train', 'experiment') else (
+            'a lower --set batch_size, and --workers 1 or more')
+        print(f'{name}: {str(error).partition(". ")[0]}: end other programs on the GPU, or give {less}',
+              file=sys.stderr)
+        return 1
+    except (KeyboardInterrupt, ImportError) as error:
+        # Modules in C that are interrupted while they are imported make an ImportError of it.
+        if not isinstance(error.__cause__ or error, KeyboardInterrupt):
+            raise
+        print(f'{name}: interrupted', file=sys.stderr)
+        return 1
+
+
+def _parsed(argv: list[str]) -> tuple[Any, argparse.Namespace]:
+    """The module of the verb, and its arguments."""
     parser = _Parser(
         prog='hand-pose', description='3D hand joints from depth images.',
         epilog='hand-pose VERB --help explains each verb.')
@@ -125,26 +157,4 @@ def main(argv: Sequence[str] | None = None) -> int:
     if unknown:
         hint = f'; {module.HINT}' if hasattr(module, 'HINT') else ''
         args.parser.error(f'unrecognized arguments: {" ".join(unknown)}{hint}')
-    try:
-        with _ending_like_ctrl_c(), _printing():
-            return module.run(args)
-    except HandPoseError as error:
-        print(f'hand-pose {args.verb}: {error}', file=sys.stderr)
-        return 1
-    except OSError as error:  # a file that cannot be read or written
-        what = f'{error.filename}: {error.strerror}' if error.filename else str(error)
-        if isinstance(error, FileExistsError | NotADirectoryError):
-            what += ', and a folder is needed: give another name'
-        print(f'hand-pose {args.verb}: {what}', file=sys.stderr)
-        return 1
-    except RuntimeError as error:
-        if type(error).__name__ != 'OutOfMemoryError':  # of PyTorch, which most verbs need not import
-            raise
-        less = '--device cpu' if args.verb not in ('train', 'experiment') else (
-            'a lower --set batch_size, and --workers 1 or more')
-        print(f'hand-pose {args.verb}: {str(error).partition(". ")[0]}: end other programs on the GPU, or give {less}',
-              file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print(f'hand-pose {args.verb}: interrupted', file=sys.stderr)
-        return 1
+    return module, args

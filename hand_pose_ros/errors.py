@@ -12,6 +12,10 @@ class InputError(HandPoseError):
     """An image, camera model, bag or file that cannot be used."""
 
 
+class BagOptionError(InputError):
+    """A bag that can be used only with one of the options in `cli.arguments.add_bag`. The message names it."""
+
+
 class CheckpointError(HandPoseError):
     """Weights that are missing, damaged, or of another kind than expected."""
 

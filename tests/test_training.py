@@ -411,12 +411,12 @@ def validations(run: Path) -> list[dict]:
     return [row for row in map(json.loads, (run / 'metrics.jsonl').open()) if 'val_mm' in row]
 
 
-def record_hand(folder: Path, skeleton: Skeleton = HAND21) -> None:
+def record_hand(folder: Path, skeleton: Skeleton = HAND21, camera: object = CAMERA) -> None:
     joints = np.array([0, 0, 0.5]) + np.random.default_rng(0).uniform(-0.05, 0.05, (len(skeleton), 3))
     hand = SimpleNamespace(id='0', side='right', score=1.0, joints=joints, confidence=np.ones(len(skeleton)),
                            cube=Cube((0.0, 0.0, 0.5), 0.3))
     with BagWriter(folder / 'hand.mcap') as file:
-        file.write_depth(0, 'camera', np.full((480, 640), 0.5, np.float32), CAMERA)
+        file.write_depth(0, 'camera', np.full((480, 640), 0.5, np.float32), camera)
         file.write_hands(0, 'camera', [hand], skeleton)
 
 
@@ -441,6 +441,16 @@ def stop_after(run: Run, step: int) -> None:
         run._stop = run.step + 1 >= step
         return train_step(module)
     run._train_step = stopping
+
+
+def test_a_bag_without_intrinsics_is_told_without_options_that_training_lacks(tmp_path, capsys):
+    for split in ('train', 'val'):
+        record_hand(tmp_path / split, camera=SimpleNamespace(fx=0.0, fy=0.0, cx=0.0, cy=0.0, width=640, height=480))
+    sets = [part for item in ('dataset=bags', f'root={tmp_path}') for part in ('--set', item)]
+    assert main(['train', 'paper', '--out', str(tmp_path / 'run'), '--cache', str(tmp_path / 'cache'), '--threads', '1',
+                 '--workers', '0', *sets]) == 1
+    assert 'or give --intrinsics FX FY CX CY (0 of 1 depth images were read); training has no such option: write ' \
+        'the bag again' in capsys.readouterr().err
 
 
 @pytest.mark.timeout(600)

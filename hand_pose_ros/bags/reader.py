@@ -25,7 +25,7 @@ from hand_pose_ros.conventions import (
     stamp_ns,
 )
 from hand_pose_ros.depth import DEPTH_ENCODINGS, decode_compressed, decode_image
-from hand_pose_ros.errors import InputError, naming
+from hand_pose_ros.errors import BagOptionError, InputError, naming
 from hand_pose_ros.geometry import Intrinsics
 from hand_pose_ros.hand import Side, side_of
 from hand_pose_ros.skeleton import SKELETONS
@@ -125,14 +125,15 @@ class DepthBag(Bag):
                     continue
                 header = message.header
                 if not cameras and not self._intrinsics:
-                    raise InputError(self._unusable or f'{self.path}: the bag counts messages of camera_info that are '
-                                     'not there: copy it again, or give --intrinsics FX FY CX CY')
+                    raise BagOptionError(
+                        self._unusable or f'{self.path}: the bag counts messages of camera_info that are not there: '
+                        'copy it again, or give --intrinsics FX FY CX CY')
                 camera = self._intrinsics if not cameras else cameras.get(header.frame_id, cameras[''])
                 yield Frame(stamp_ns(header), header.frame_id, self.depth_topic, recorded_ns, message, camera,
                             self._depth_scale)
                 count += 1
         except InputError as error:
-            raise InputError(f'{error} ({count} of {len(self)} depth images were read)') from error
+            raise type(error)(f'{error} ({count} of {len(self)} depth images were read)') from error
 
     def _remember(self, connection: Connection, info: Any, cameras: dict[str, Intrinsics]) -> bool:
         """Keep the intrinsics as the newest for their frame_id, and under '' as the newest. False if unusable."""
@@ -155,8 +156,8 @@ class DepthBag(Bag):
         if len(topics) == 1:
             return topics[0]
         if topics:
-            raise InputError(f'{self.path}: several topics carry depth: choose one with --depth-topic: '
-                             + ', '.join(topics))
+            raise BagOptionError(f'{self.path}: several topics carry depth: choose one with --depth-topic: '
+                                 + ', '.join(topics))
         if zstd := sorted(c.topic for c in self.connections if c.topic.endswith(f'/{ZSTD}')):
             raise InputError(f'{self.path}: no topic carries depth that can be read, and of {", ".join(zstd)} '
                              f'{ZSTD_REMEDY}')
@@ -175,8 +176,8 @@ class DepthBag(Bag):
         found = [c for c in self.connections if c.topic == topic and c.msgtype in types and c.msgcount]
         if not found:
             kinds = ' or '.join(map(_ros_name, types))
-            raise InputError(f'{self.path}: there is no {kinds} on {topic}: give {remedy} '
-                             f'(the bag has {self._topics()})')
+            raise BagOptionError(f'{self.path}: there is no {kinds} on {topic}: give {remedy} '
+                                 f'(the bag has {self._topics()})')
         return found
 
     def _topics(self) -> str:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hand_pose_ros.errors import HandPoseError, naming
+from hand_pose_ros.errors import BagOptionError, HandPoseError, InputError, naming
 from hand_pose_ros.files import check_writable
 from hand_pose_ros.geometry import Intrinsics
 
@@ -97,6 +98,15 @@ def add_bag(parser: Any) -> None:
                         help='of the camera, in pixels; they replace those of camera_info')
     parser.add_argument('--depth-scale', type=metres, default=0.001, metavar='M',
                         help='metres per unit of 16-bit depth (0.001)')
+
+
+@contextmanager
+def without_bag_options(remedy: str) -> Iterator[None]:
+    """For a verb without the options of `add_bag`: if a bag needs one of them, end the message with the remedy."""
+    try:
+        yield
+    except BagOptionError as error:
+        raise InputError(f'{error}; {remedy}') from error
 
 
 def check_intrinsics(args: argparse.Namespace) -> None:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from hand_pose_ros.bags import DepthBag, RecordedHands, read_hands
+from hand_pose_ros.cli.arguments import without_bag_options
 from hand_pose_ros.drawing import Picture, contact_sheet, overlay
 from hand_pose_ros.errors import InputError, counted
 from hand_pose_ros.files import in_one_step, write_bytes, write_json
@@ -51,17 +52,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--model', default='', help='name of weights that ship, or path of a checkpoint (hand_dense)')
 
 
+@without_bag_options(HINT)
 def run(args: argparse.Namespace) -> int:
     """Play the bag, draw the answers and print a summary. Returns 1 if an image got no answer."""
-    try:
-        return _run(args)
-    except InputError as error:
-        if ' --' in str(error):  # an option that other verbs have
-            raise InputError(f'{error}; {HINT}') from error
-        raise
-
-
-def _run(args: argparse.Namespace) -> int:
     from hand_pose_ros.evaluation.bag_evaluation import until_damaged
     from hand_pose_ros.ros.conversions import hand_from_msg
     from hand_pose_ros.ros.live import play_through_node

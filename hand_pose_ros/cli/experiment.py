@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hand_pose_ros.cli.train import add_machine_arguments, machine, show_progress
+from hand_pose_ros.cli.arguments import without_bag_options
+from hand_pose_ros.cli.train import BAG_REMEDY, add_machine_arguments, machine, show_progress
 
 DESCRIPTION = """\
 Repeat an experiment of the paper: train the networks that it needs, test them, and write tables and plots.
@@ -40,6 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_machine_arguments(parser)
 
 
+@without_bag_options(BAG_REMEDY)
 def run(args: argparse.Namespace) -> int:
     """Train what is missing, test, write the results and print the table."""
     from tqdm.contrib.logging import logging_redirect_tqdm

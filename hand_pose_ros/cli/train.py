@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hand_pose_ros.cli.arguments import count, none_or_more
+from hand_pose_ros.cli.arguments import count, none_or_more, without_bag_options
 from hand_pose_ros.files import check_writable
 
 if TYPE_CHECKING:
@@ -32,6 +32,10 @@ EXAMPLES = """examples:
 
 recipes: paper, original-code, modern, finder. docs/training.md says what they do, training/recipes.py lists the keys.
 """
+
+
+BAG_REMEDY = ('training has no such option: write the bag again with one depth topic and its camera_info beside it, as '
+              'examples/train_on_your_bags.py does')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -76,6 +80,7 @@ def show_progress() -> None:
     atexit.register(signal.signal, signal.SIGINT, signal.SIG_DFL)
 
 
+@without_bag_options(BAG_REMEDY)
 def run(args: argparse.Namespace) -> int:
     """Train, or resume, and name the best weights.
 

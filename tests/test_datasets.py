@@ -4,6 +4,7 @@ import gzip
 import logging
 import multiprocessing
 import os
+import shutil
 import struct
 import zlib
 from functools import partial
@@ -16,7 +17,7 @@ import pytest
 import torch
 from scipy.io import savemat
 
-from hand_pose_ros.bags import BagWriter, DepthBag
+from hand_pose_ros.bags import BagWriter, DepthBag, read_hands
 from hand_pose_ros.datasets import DatasetError, joints_in_metres, open_dataset
 from hand_pose_ros.datasets import bags as bags_module
 from hand_pose_ros.datasets import icvl as icvl_module
@@ -262,22 +263,31 @@ def test_labelled_images_of_bags_are_samples_and_left_hands_are_mirrored_in(tmp_
         open_dataset('bags', 'train', tmp_path)
 
 
-def test_bags_that_were_corrected_are_not_read_from_the_cache(tmp_path):
+@pytest.mark.parametrize('name', ['mine.mcap', 'mine'])
+def test_bags_that_were_corrected_are_not_read_from_the_cache_and_those_that_were_moved_are(tmp_path, name):
     joints = scattered(np.random.default_rng(4), 21, np.array([0.1, 0.0, 0.5]))
-    path, middle = tmp_path / 'train' / 'mine.mcap', joints.mean(0)
+    path, middle = tmp_path / 'train' / name, joints.mean(0)
+    with BagWriter(tmp_path / 'train' / 'another.mcap') as bag:
+        write_hand(bag, 1000, 'right', joints)
 
     def recorded(camera: Intrinsics, side: str, seconds: int, joints: np.ndarray = joints) -> str:
+        shutil.rmtree(path, ignore_errors=True)
         with BagWriter(path) as bag:
             bag.write_depth(1000, 'camera', blob(BAG_CAMERA, middle), camera)
             write_hand(bag, 1000, side, joints)
-        os.utime(path, (seconds, seconds))
+        for file in (path, *path.rglob('*')):  # a folder does not become newer with what is in its files
+            os.utime(file, (0, 0) if file.is_dir() else (seconds, seconds))
         return open_dataset('bags', 'train', tmp_path).fingerprint
 
     first = recorded(BAG_CAMERA, 'right', 1)
     assert recorded(BAG_CAMERA, 'right', 1) == first
     assert recorded(BAG_CAMERA, 'left', 1) != first
     assert recorded(BAG_CAMERA, 'right', 1, joints + 0.01) != first
-    assert recorded(Intrinsics(310, 310, 160, 120, 320, 240), 'right', 2) != first
+    last = recorded(Intrinsics(310, 310, 160, 120, 320, 240), 'right', 2)
+    assert last != first
+    (tmp_path / 'moved').mkdir()
+    (tmp_path / 'train').rename(tmp_path / 'moved' / 'train')
+    assert open_dataset('bags', 'train', tmp_path / 'moved').fingerprint == last
 
 
 def test_images_of_a_bag_are_found_in_whatever_order_they_were_recorded(tmp_path):
@@ -299,7 +309,7 @@ def test_images_of_a_bag_are_found_in_whatever_order_they_were_recorded(tmp_path
 
 
 def test_a_bag_is_read_once_and_stamps_may_be_those_of_another(tmp_path, monkeypatch):
-    rng, opened = np.random.default_rng(4), []
+    rng, opened, listed = np.random.default_rng(4), [], Path.glob
     monkeypatch.setattr(bags_module, 'DepthBag', lambda path: opened.append(path.stem) or DepthBag(path))
     for k, name in enumerate('ab'):
         with BagWriter(tmp_path / 'train' / f'{name}.mcap') as bag:
@@ -308,6 +318,7 @@ def test_a_bag_is_read_once_and_stamps_may_be_those_of_another(tmp_path, monkeyp
                 hand = labelled('right', scattered(rng, 21, middle))
                 bag.write_depth(stamp, 'camera', blob(BAG_CAMERA, middle), BAG_CAMERA)
                 bag.write_hands(stamp, 'camera', [hand, hand], HAND21)
+    monkeypatch.setattr(Path, 'glob', lambda *where: sorted(listed(*where), reverse=True))  # disks differ in it
     dataset = open_dataset('bags', 'train', tmp_path)
     nearest = [dataset.frame(index).depth[120, 160] for index in (*range(12), 2, 8)]
     expected = [0.34, 0.34, 0.44, 0.44, 0.54, 0.54, 0.39, 0.39, 0.49, 0.49, 0.59, 0.59, 0.44, 0.49]
@@ -315,23 +326,48 @@ def test_a_bag_is_read_once_and_stamps_may_be_those_of_another(tmp_path, monkeyp
     assert opened == ['a', 'b', 'a', 'b']
 
 
-def test_hands_without_a_joint_are_left_out_and_those_without_a_side_are_told_of(tmp_path, caplog):
+@pytest.mark.parametrize('name', ['mine.bag', 'mine.mcap', 'mine.db3'])
+def test_a_bag_that_cannot_be_read_is_named_and_not_passed_over(tmp_path, name):
+    (tmp_path / 'train').mkdir()
+    (tmp_path / 'train' / name).touch()
+    with pytest.raises(InputError, match=rf'train/{name}: .*it is empty: record or copy it again'):
+        open_dataset('bags', 'train', tmp_path)
+
+
+def test_a_bag_that_is_damaged_is_not_learned_from_in_part(tmp_path):
+    joints = scattered(np.random.default_rng(4), 21, np.array([0.1, 0.0, 0.5]))
+    (tmp_path / 'train').mkdir()
+    with BagWriter(tmp_path / 'whole.mcap') as bag:
+        for stamp in range(12):
+            bag.write_depth(stamp, 'camera', blob(BAG_CAMERA, joints.mean(0)), BAG_CAMERA, codec=None)
+            write_hand(bag, stamp, 'right', joints)
+    whole = (tmp_path / 'whole.mcap').read_bytes()
+    (tmp_path / 'train' / 'cut.mcap').write_bytes(whole[:len(whole) * 3 // 4])
+    assert read_hands(tmp_path / 'train' / 'cut.mcap', partly=True)
+    with pytest.raises(InputError, match=r'cut\.mcap: the bag was cut short'):
+        open_dataset('bags', 'train', tmp_path)
+
+
+def test_hands_without_a_joint_are_left_out_and_those_without_a_side_are_told_of(tmp_path, caplog, monkeypatch):
     joints = scattered(np.random.default_rng(4), 21, np.array([0.1, 0.0, 0.5]))
     lost, unset = joints.copy(), joints.copy()
     lost[7], unset[:] = np.nan, 0
     with BagWriter(tmp_path / 'train' / 'mine.mcap') as bag:
-        for stamp, hands in enumerate(([('right', joints)], [('left', lost), ('unknown', joints)], [('left', unset)])):
+        for stamp, hands in enumerate(([('right', joints)], [('left', lost), ('unknown', joints), ('right', joints)],
+                                       [('left', unset)])):
             bag.write_depth(stamp, 'camera', blob(BAG_CAMERA, joints.mean(0)), BAG_CAMERA)
             bag.write_hands(stamp, 'camera', [labelled(*hand) for hand in hands], HAND21)
     with BagWriter(tmp_path / 'val' / 'mine.mcap') as bag:
         write_hand(bag, 0, 'left', unset)
     with caplog.at_level(logging.WARNING):
         dataset = open_dataset('bags', 'train', tmp_path)
-    assert dataset.size == 2 and dataset.batch(torch.arange(2))['joints'].isfinite().all()
-    assert not any(dataset.frame(index).left for index in range(2))
+        monkeypatch.setattr(multiprocessing, 'parent_process', lambda: 'the training')
+        open_dataset('bags', 'train', tmp_path)  # as the processes that make samples do, which tell nothing again
+    assert dataset.size == 3 and dataset.batch(torch.arange(3))['joints'].isfinite().all()
+    assert not any(dataset.frame(index).left for index in range(3))
     left_out, sideless = caplog.messages
-    assert 'mine.mcap: 2 of 4 hands' in left_out and 'left out' in left_out
-    assert 'mine.mcap: the side of 1 of 2 hands is unknown' in sideless
+    assert 'mine.mcap: 2 of 5 hands' in left_out and 'left out' in left_out
+    assert 'mine.mcap: the side of 1 of 3 hands is unknown' in sideless
     with pytest.raises(DatasetError, match='val must hold hands of one skeleton, not of none'):
         open_dataset('bags', 'val', tmp_path)
 

@@ -159,6 +159,17 @@ def test_report_of_nothing_found_can_be_written(result, tmp_path):
     assert legends(plots.curves([nothing])) == [' n   AUC 0.000, mean -']
 
 
+def test_tables_in_the_info_of_a_result_are_tables_of_the_report(result, tmp_path):
+    info = {'model': 'm', 'files': ['a', 'b'], 'hidden_joints': {'joints': 850, 'mean_mm': 10.96674605},
+            'frames_by_visible': [{'visible': [0, 7], 'mean_mm': 12.422}, {'visible': [8, 21], 'mean_mm': 7.588}]}
+    page = write_report([replace(result, info=info)], tmp_path).read_text()
+    for row in (('850', '10.967'), ('0 to 7', '12.422'), ('8 to 21', '7.588')):
+        assert '<tr>' + ''.join(f'<td>{cell}</td>' for cell in row) + '</tr>' in page
+    assert 'hidden joints:' in page and '<th>visible</th><th>mean_mm</th>' in page
+    assert 'files</td><td class="text">[' in page and '850, ' not in page
+    assert 'More numbers' not in write_report([result], tmp_path).read_text()
+
+
 def test_report_of_no_frames_can_be_written(result, tmp_path):
     none = replace(result, predictions=result.predictions[:0], truth=result.truth[:0], stamps_ns=result.stamps_ns[:0],
                    seconds={stage: seconds[:0] for stage, seconds in result.seconds.items()})

@@ -83,8 +83,10 @@ def write_report(results: Sequence[Result], folder: str | Path, read_depths: Rea
         _section('Frames', '<p class="soft">Drag a 3D view to turn it, turn the wheel to zoom, double-click to go back.'
                  + (' The truth is dashed.' if result.truth is not None else '') + '</p><div class="frames">'
                  + ''.join(card.html for card in cards) + '</div>') if cards else '',
+        _section('More numbers', more) if (more := _more(result)) else '',
         _section('Where this comes from', _table(
-            ('', ''), sorted((key, str(value)) for key, value in result.info.items()), text=True)),
+            ('', ''), sorted((key, str(value)) for key, value in result.info.items()
+                             if not _rows(value)), text=True)),
         _section('What the numbers mean', '<dl>' + ''.join(
             f'<dt>{escape(term)}</dt><dd>{escape(text)}</dd>' for term, text in _DEFINITIONS) + '</dl>'),
     ]
@@ -219,6 +221,25 @@ def _published(result: Result) -> str:
         return ''
     return (f'<p class="soft">Published means on {dataset.name} (table of Moon et al., V2V-PoseNet, 2018):</p>'
             + _table(('method', 'mean, mm'), [(name, f'{mean:g}') for name, mean in dataset.published]))
+
+
+def _more(result: Result) -> str:
+    """The tables in the info of a result: of the benchmark, errors by visibility, and the calibration."""
+    return ''.join(f'<p class="soft">{escape(key.replace("_", " "))}:</p>'
+                   + _table(rows[0], [tuple(map(_cell, row.values())) for row in rows])
+                   for key, value in result.info.items() if (rows := _rows(value)))
+
+
+def _rows(value: Any) -> list[dict[str, Any]]:
+    """The rows of a table; empty if the value is no table."""
+    rows = value if isinstance(value, list) else [value]
+    return rows if all(isinstance(row, dict) for row in rows) else []
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, list):
+        return ' to '.join(map(str, value))
+    return f'{value:.3f}' if isinstance(value, float) else str(value)
 
 
 def _table(head: Iterable[str], rows: Iterable[Sequence[str]], text: bool = False) -> str:

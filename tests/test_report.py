@@ -207,6 +207,7 @@ def test_errors_and_times_are_drawn_where_they_were(result):
     for label, expected in (('mean of joints', metrics.frame_means_mm(errors)), ('worst joint', errors.max(axis=1))):
         np.testing.assert_allclose(lines[label], [at, np.where(np.arange(40) == 7, np.nan, expected)])
     assert lines['missed'][0] == pytest.approx(at[7:8]) and axes.get_ylim()[1] > errors[np.isfinite(errors)].max()
+    assert axes.get_title('left') == 'Error of each frame', 'true also of frames that do not follow each other'
     assert [text.get_text() for text in axes.texts] == ['first', 'second']
     starts = [text.xy[0] for text in axes.texts]
     assert starts == [line.get_xdata()[0] for line in axes.lines[-2:]] == pytest.approx(at[[0, 20]])

@@ -107,7 +107,7 @@ def over_time(result: Result) -> Figure:
         axes.axvline(at[start], color='#4a5560', lw=1, ls=':')
         axes.annotate(name, (at[start], 1), xycoords=('data', 'axes fraction'), xytext=(4, -2), fontsize=9,
                       textcoords='offset points', va='top', color='#4a5560')
-    axes.set(title='Error over time', xlabel=label, ylabel='error, mm', ylim=(0, top or 1),
+    axes.set(title='Error of each frame', xlabel=label, ylabel='error, mm', ylim=(0, top or 1),
              xlim=(at[0], at[-1]))
     axes.legend(fontsize=9, ncols=3, loc='lower right', bbox_to_anchor=(1, 1))
     return figure

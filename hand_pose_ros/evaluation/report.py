@@ -78,7 +78,7 @@ def write_report(results: Sequence[Result], folder: str | Path, read_depths: Rea
           for name, title, extra in (
             ('curves', 'How many frames and joints are within a distance', _published(result)),
             ('joints', 'Which joints are hard', _fingers(scored)),
-            ('errors', 'When it errs', ''),
+            ('errors', 'Which frames are hard', ''),
             ('latency', 'What a frame costs', _latency(summary))) if name in figures),
         _section('Frames', '<p class="soft">Drag a 3D view to turn it, turn the wheel to zoom, double-click to go back.'
                  + (' The truth is dashed.' if result.truth is not None else '') + '</p><div class="frames">'

@@ -348,8 +348,7 @@ def test_many_bags_at_once_and_one_that_fails(tmp_path, bag, model, settings, ca
 
 def test_a_bag_that_is_given_twice_is_refused_however_it_is_spelled(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    Path('link.mcap').symlink_to('x.mcap')
-    for spelling in ('x.mcap', './x.mcap', str(tmp_path / 'x.mcap'), 'link.mcap'):
+    for spelling in ('x.mcap', './x.mcap', 'day1/../x.mcap', os.path.abspath('x.mcap')):
         with pytest.raises(SystemExit) as caught:
             main(['evaluate', 'other.mcap', 'x.mcap', spelling])
         assert caught.value.code == 2

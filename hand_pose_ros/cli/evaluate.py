@@ -98,7 +98,7 @@ def run(args: argparse.Namespace) -> int:
         args.parser.error('give either bags or --predictions')
     places: dict[str, str] = {}
     for bag in args.bags:
-        place = os.path.realpath(bag)
+        place = os.path.abspath(bag)  # links may have names of their own
         if place in places:  # both would write the same files
             args.parser.error(f'{places[place]} and {bag} are the same bag: give it once')
         places[place] = bag

@@ -80,7 +80,8 @@ class TwoLooks(nn.Module):
             the second look. The first look may be much smaller, because it only finds where to look.
 
     Raises:
-        HandPoseError: root or knuckles are not among the joints, or a `HandDense` does not take these options.
+        HandPoseError: root or knuckles are not among the joints, a knuckle is given twice, or a `HandDense` does not
+            take these options.
     """
 
     outputs = HandDense.outputs
@@ -91,6 +92,8 @@ class TwoLooks(nn.Module):
         super().__init__()
         if not all(0 <= joint < joints for joint in (root, *knuckles)) or not knuckles:
             raise HandPoseError(f'root {root} and knuckles {list(knuckles)} are not all among {joints} joints')
+        if len(set(knuckles)) < len(knuckles):
+            raise HandPoseError(f'knuckles {list(knuckles)}: give each joint once')
         self.root, self.knuckles = root, list(knuckles)
         second: dict[str, Any] = {'width': width, 'bottleneck': bottleneck, 'blocks': blocks, 'refined': refined}
         self.first = HandDense(joints, **(first or second))

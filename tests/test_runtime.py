@@ -8,6 +8,7 @@ import logging
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 from torch import nn
 
 from hand_pose_ros.cli import main
@@ -401,13 +402,39 @@ def test_rounding_alone_is_not_taken_for_an_engine_that_is_wrong(name, monkeypat
     assert cuda_engine._agree(TorchEngine(halved.reduce_precision()), TorchEngine(pipeline))
 
 
-def test_fused_layers_give_what_the_layers_give():
+class OnGpu(torch.Tensor):
+    """A stand-in."""
+
+    is_cuda = True
+
+
+@pytest.mark.parametrize('cudnn', ['', 'can', 'cannot'])
+def test_fused_layers_give_what_the_layers_give(cudnn, monkeypatch):
+    """Also on a GPU, with a cuDNN that fuses them and with one that does not; here with stand-ins."""
+    asked = []
+
+    def convolution_relu(x, *sizes, added=0):
+        asked.append(x)
+        if cudnn == 'cannot':
+            raise RuntimeError('no engine')
+        return F.relu(F.conv2d(x, *sizes) + added)
+
+    def convolution_add_relu(x, weight, added, alpha, *sizes):
+        assert added.shape[1] == weight.shape[0] and alpha == 1
+        return convolution_relu(x, weight, *sizes, added=added)
+
+    monkeypatch.setattr(torch, 'cudnn_convolution_relu', convolution_relu)
+    monkeypatch.setattr(torch, 'cudnn_convolution_add_relu', convolution_add_relu)
     network = trained('two_looks')
     fused, patches = copy.deepcopy(network), torch.from_numpy(hand_patches(3))
     fuse(fused)
     assert not any(isinstance(module, nn.BatchNorm2d) for module in fused.modules())
     with torch.inference_mode():
-        torch.testing.assert_close(fused(patches), network(patches), atol=1e-4, rtol=0)
+        shown = patches.as_subclass(OnGpu) if cudnn else patches
+        for _ in range(2):  # what cannot be is asked for once
+            torch.testing.assert_close(torch.Tensor(fused(shown)), network(patches), atol=1e-4, rtol=0)
+    once = 2 * (1 + 8 + 1)  # the stem, two in each of four blocks, and what fuses their maps, of two looks
+    assert len(asked) == {'': 0, 'can': 2 * once, 'cannot': once}[cudnn]
 
 
 @pytest.fixture

@@ -233,13 +233,13 @@ def test_a_killed_run_continues_bit_for_bit(folder, tmp_path):
               'from hand_pose_ros.cli import main; sys.exit(main(sys.argv[1:]))')
     long = ('samples=40_000', 'val_every=100_000')
     arguments = command(folder, tmp_path, *long)
-    process = subprocess.Popen([sys.executable, '-c', script, *arguments], stderr=subprocess.DEVNULL)
+    process = subprocess.Popen([sys.executable, '-c', script, *arguments], stderr=subprocess.PIPE)
     state = tmp_path / 'state.safetensors'
     while not state.exists() and process.poll() is None:
         time.sleep(0.05)
     time.sleep(0.5)
     process.kill()
-    process.wait()
+    process.communicate(timeout=60)  # which ends when no child holds its end of the pipe any more
     stopped_at = int(load_progress(state)['step'])
     assert 0 < stopped_at < 10_000
     again = Run(tmp_path, get_recipe('paper', [*TINY, f'root={folder}', *long]), Machine(folder / 'cache', workers=0))

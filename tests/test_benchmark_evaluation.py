@@ -122,9 +122,14 @@ def test_a_network_is_scored_on_the_test_frames_of_its_dataset(folder, tmp_path,
                     build('or_ref', joints=16))
     arguments = ['evaluate', 'icvl', '--root', str(folder), '--device', 'cpu']
     for split, frames in ((['--split', 'test_1'], 3), ([], 6)):
-        assert main([*arguments, *split, '--model', str(weights), '--json', str(json_file)]) == 0
+        assert main([*arguments, *split, '--model', str(weights), '--json', str(json_file),
+                     '--out', str(tmp_path / f'{frames}.npz')]) == 0
         summary = json.loads(json_file.read_text())
         assert summary['frames'] == frames
+    capsys.readouterr()
+    assert main([*arguments, '--model', str(weights), '--compare', f'before={tmp_path / "6.npz"}']) == 0
+    _, now, before = (line.split()[-12:] for line in capsys.readouterr().out.splitlines())
+    assert now == before
     batch = open_dataset('icvl', 'test', folder).batch(torch.arange(6))
     cube = batch['cube_center'], batch['cube_side']
     checkpoint = load_checkpoint(weights)

@@ -11,6 +11,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -27,6 +28,8 @@ from hand_pose_ros.evaluation.bag_evaluation import Settings, evaluate_bag, eval
 from hand_pose_ros.evaluation.ground_truth import Truth, with_truth
 from hand_pose_ros.evaluation.results import Result
 from hand_pose_ros.geometry import Cube, Intrinsics
+from hand_pose_ros.models import build
+from hand_pose_ros.models.checkpoints import save_checkpoint
 from hand_pose_ros.skeleton import HAND21, get_skeleton
 
 CAMERA = Intrinsics(240, 240, 159.5, 119.5, 320, 240)
@@ -330,15 +333,20 @@ def test_real_bags_without_camera_info_need_intrinsics(shared_data, model, capsy
         assert 'raw: 1 frame, ' in capsys.readouterr().out.replace(name, 'raw')
 
 
-def test_many_bags_at_once_and_one_that_fails(tmp_path, bag, model, settings, capsys):
+def test_many_bags_at_once_and_one_that_fails(tmp_path, bag, model, settings, monkeypatch, capsys):
+    reported = []
+    monkeypatch.setattr('hand_pose_ros.evaluation.report.write_report',
+                        lambda results, folder, read: reported.append((folder.name, *read([0]))) or folder)
     same_name = record(tmp_path / 'other' / 'ball.mcap', frames=4)
     code = main(['evaluate', str(bag), str(tmp_path / 'none.mcap'), str(same_name), '--model', model, '--device', 'cpu',
                  '--detector', 'nearest', '--min-score', '0', '--json', str(tmp_path / 'all.json'),
-                 '--out', str(tmp_path / 'out'), '--out-bag', str(tmp_path / 'hands')])
+                 '--out', str(tmp_path / 'out'), '--out-bag', str(tmp_path / 'hands'), '--report', str(tmp_path)])
     captured = capsys.readouterr()
     assert code == 1 and 'none.mcap: there is no such bag' in captured.err and '1 of 3 bags failed' in captured.err
     got = json.loads((tmp_path / 'all.json').read_text())['bags']
+    assert list(got) == [str(bag), str(tmp_path / 'none.mcap'), str(same_name)], 'in the order of the command'
     assert [got[str(bag)]['frames'], got[str(same_name)]['frames']] == [FRAMES, 4]
+    assert sorted(reported) == sorted((got[str(each)]['name'], 0) for each in (bag, same_name))
     results = sorted((tmp_path / 'out').iterdir())
     assert len(results) == 2 and len(list((tmp_path / 'hands').iterdir())) == 2, 'equal names do not collide'
     alone = evaluate_bag(bag, settings)
@@ -490,6 +498,93 @@ def test_processes_that_evaluate_end_with_the_one_that_started_them_and_leave_no
     assert 'Traceback' not in whole.communicate(timeout=200)[1]
     assert wait(lambda: not any(map(runs, started)))
     assert [*tmp_path.glob('hands/*'), *tmp_path.glob('hands/.*')] == []
+
+
+def test_answers_of_the_live_node_are_scored_by_their_stamps(tmp_path, monkeypatch, capsys):
+    """Without the node: what it is asked for, and what its answers become."""
+    pytest.importorskip('rclpy', reason='ROS is not installed')
+    from hand_pose_ros.ros.live import Answers
+    icvl16, stamps = get_skeleton('icvl16'), [10**9 + k * STEP_NS for k in range(5)]
+    truth = np.random.default_rng(0).uniform(0.4, 0.6, (5, 16, 3))
+    save_checkpoint(tmp_path / 'icvl.safetensors', build('shallow', joints=16),
+                    {'skeleton': 'icvl16', 'cube_side': 0.25})
+    for frame in ('camera', 'base_link'):
+        with BagWriter(tmp_path / f'{frame}.mcap') as bag:
+            for k, stamp in enumerate(stamps):
+                rows = 120 if k == 0 or (frame == 'base_link' and k < 4) else 240  # too few for this camera
+                for topic in ('/depth/image_rect', '/other/image_rect'):
+                    bag.write_depth(stamp, 'camera', depth_image(k)[:rows], CAMERA, topic=topic, codec=None)
+                hand = HandEstimate(truth[k].astype(np.float32), icvl16.joint_names, np.ones(16, np.float32), 1.0,
+                                    'right', Cube((0, 0, 0.5), 0.3), 'a')
+                bag.write_hands(stamp, frame, [hand], icvl16, '/truth/joints')
+
+    def hands(number, k):
+        points = [SimpleNamespace(x=x, y=y, z=z) for x, y, z in truth[k] + [0.006, 0, 0.008]]  # 10 mm off
+        return SimpleNamespace(hands=[SimpleNamespace(id=number, joints=points)])
+
+    def play(bag, *given):
+        asked.append((bag.depth_topic, *given))
+        return Answers('icvl16', {stamps[1]: hands('1', 1), stamps[2]: hands('2', 2),
+                                  stamps[3]: SimpleNamespace(hands=[])},
+                       {stamps[1]: 0.010, stamps[2]: 0.020, stamps[3]: 0.030})
+
+    asked = []
+    monkeypatch.setattr('hand_pose_ros.ros.live.play_through_node', play)
+    more = ('--via-ros', '--depth-topic', '/other/image_rect', '--ground-truth', '/truth/joints',
+            '--json', tmp_path / 'r.json')
+    model = str(tmp_path / 'icvl.safetensors')
+    assert main(arguments(tmp_path / 'camera.mcap', model, *more, '--camera-info-topic', '/depth/camera_info', '--side',
+                          'left', '--cube-size', '0.2', '--depth-scale', '0.002')) == 0
+    parameters = {'model': model, 'device': 'cpu', 'side': 'left', 'detector': 'nearest', 'cube_size': 0.2,
+                  'min_score': 0.0, 'depth_scale': 0.002, 'max_hands': 1}
+    assert asked.pop() == ('/other/image_rect', '/depth/camera_info', parameters)
+    got, said = json.loads((tmp_path / 'r.json').read_text()), capsys.readouterr()
+    assert [got[key] for key in ('name', 'frames', 'dropped', 'missed_frames', 'tracks', 'damaged', 'model')] == [
+        'camera', 5, 2, 3, 2, False, model]
+    assert got['mean_mm'] == pytest.approx(10, abs=1e-3) and got['max_mm'] == pytest.approx(10, abs=1e-3)
+    assert got['latency_ms']['image to joints']['mean'] == pytest.approx(20)
+    assert got['notes'] == ['2 of 5 images got no answer from the node and count as images without a hand.']
+    assert 'camera: 5 frames, 40.0 % with a hand, 2 tracks, 2 dropped' in said.out
+    assert main(arguments(tmp_path / 'base_link.mcap', model, *more)) == 1
+    assert "in frame 'base_link', but the images in 'camera'" in capsys.readouterr().err
+    assert asked.pop()[1:] == (None, {name: value for name, value in parameters.items() if name != 'cube_size'}
+                               | {'side': 'auto', 'depth_scale': 0.001})
+
+
+def test_a_bag_without_an_image_that_can_be_decoded_is_not_played(tmp_path, model, monkeypatch, capsys):
+    pytest.importorskip('rclpy', reason='ROS is not installed')
+    monkeypatch.setattr('hand_pose_ros.ros.live.play_through_node', lambda *_: pytest.fail('it is played'))
+    with BagWriter(tmp_path / 'half.mcap') as bag:
+        bag.write_depth(10**9, 'camera', depth_image(0)[:120], CAMERA, codec=None)
+    assert main(arguments(tmp_path / 'half.mcap', model, '--via-ros')) == 1
+    assert 'half.mcap: there is no depth image that can be decoded' in capsys.readouterr().err
+
+
+def test_a_bag_is_compared_with_an_earlier_result(tmp_path, bag, model, result, monkeypatch, capsys):
+    earlier = replace(result, truth=result.predictions - [0.006, 0, 0.008], notes=('it was dark.',))
+    earlier.save(tmp_path / 'before.npz')
+    replace(earlier, skeleton=replace(HAND21, name='other')).save(tmp_path / 'other.npz')
+    np.savez(tmp_path / 'truth.npz', joints=result.predictions)
+    reported = []
+    monkeypatch.setattr('hand_pose_ros.evaluation.report.write_report',
+                        lambda *given: reported.append(given) or 'out/report.html')
+    more = ('--ground-truth', tmp_path / 'truth.npz', '--report', tmp_path / 'out', '--compare')
+    assert main(arguments(bag, model, *more, tmp_path / 'before.npz')) == 0
+    said = capsys.readouterr()
+    _, now, before, *latency = said.out.splitlines()
+    assert now.split()[:5] == ['ball', '12', '0', '0.000', '0.000']
+    assert before.split()[:5] == ['before', '12', '0', '10.000', '10.000']
+    assert latency[0].startswith('ball: 12 frames, 100.0 % with a hand, 1 track, ')
+    assert sum(line.startswith('total ') for line in latency) == 2 and latency[-1] == 'report: out/report.html'
+    assert said.err == 'NOTE: before: it was dark.\n'
+    (results, folder, read_depths), = reported
+    assert [one.name for one in results] == ['ball', 'before'] and folder == str(tmp_path / 'out')
+    assert read_depths([3])[3] == pytest.approx(depth_image(3), abs=1e-3)
+    assert main(arguments(bag, model, *more, tmp_path / 'other.npz')) == 1
+    assert '--compare: all results must have the joints of hand21' in capsys.readouterr().err
+    monkeypatch.setattr(HandPoseEstimator, '__call__', lambda *_, **__: pytest.fail('what is wrong is told first'))
+    assert main(arguments(bag, model, *more, tmp_path / 'none.npz')) == 1
+    assert 'none.npz: the file cannot be read' in capsys.readouterr().err
 
 
 def test_the_default_weights_have_one_name_with_and_without_the_node(tmp_path, bag, monkeypatch):

@@ -127,6 +127,20 @@ def test_the_table_can_be_written_where_there_are_no_signs_but_ascii(tmp_path, u
     assert '<=20' in done.stdout
 
 
+def test_predictions_are_compared_with_others_of_their_dataset(tmp_path, uvd, capsys):
+    for name, moved in (('p', 0), ('q', 10), ('g', 0)):
+        write_uvd(tmp_path / f'{name}.txt', uvd + np.array([0, 0, moved]))
+    arguments = ['evaluate', '--predictions', str(tmp_path / 'p.txt'), '--ground-truth', str(tmp_path / 'g.txt'),
+                 '--dataset', 'nyu', '--compare', f'near={tmp_path / "q.txt"}']
+    assert main(arguments) == 0
+    _, own, other = capsys.readouterr().out.splitlines()
+    assert own.split()[:4] == ['p', '5', '0', '0.000'] and other.split()[:3] == ['near', '5', '0']
+    assert 10 < float(other.split()[3]) < 12
+    with pytest.raises(SystemExit):
+        main([*arguments[:3], *arguments[5:]])
+    assert '--predictions needs --ground-truth and --dataset' in capsys.readouterr().err
+
+
 def test_names_on_both_sides_decide_what_belongs_together(tmp_path, uvd):
     names = [f'{k}.png' for k in range(5)]
     truth = write_uvd(tmp_path / 'g.txt', uvd, names)

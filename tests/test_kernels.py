@@ -14,10 +14,11 @@ if DEVICE == 'cpu':
 pytest.importorskip('triton', reason='needs Triton, which comes with PyTorch for CUDA')
 
 from hand_pose_ros.models import build, dense  # noqa: E402
+from hand_pose_ros.models.prior import PriorOverVotes  # noqa: E402
 from hand_pose_ros.models.refiner import FAR, _framed, cut  # noqa: E402
 from hand_pose_ros.runtime import cuda_engine, kernels  # noqa: E402
 from hand_pose_ros.runtime.engine import Pipeline  # noqa: E402
-from hand_pose_ros.runtime.fused import Convolution, FusedRefinement, Linear, fuse  # noqa: E402
+from hand_pose_ros.runtime.fused import Convolution, FusedPrior, FusedRefinement, Linear, fuse  # noqa: E402
 
 
 @pytest.fixture(autouse=True)
@@ -27,16 +28,21 @@ def single_precision():
         yield
 
 
+def strewn(x: torch.Tensor) -> torch.Tensor:
+    """The same on the device, but not side by side in memory, as parts of larger tensors are."""
+    return torch.stack([x, torch.full_like(x, torch.nan)], dim=-1).to(DEVICE)[..., 0]
+
+
 CONVOLUTIONS = [
     # inputs, filters, size, stride, padding, pool, side, groups
-    (1, 8, 5, 1, 0, 4, 33, 1), (8, 8, 5, 1, 0, 2, 16, 1), (8, 8, 3, 1, 0, 1, 7, 1), (1, 8, 5, 1, 0, 2, 14, 3),
+    (1, 8, 5, 1, 0, 4, 17, 1), (8, 8, 5, 1, 0, 2, 16, 1), (8, 8, 3, 1, 0, 1, 7, 1), (1, 8, 5, 1, 0, 2, 14, 3),
     (8, 4, 3, 1, 0, 2, 9, 2), (1, 16, 5, 2, 2, 2, 24, 1), (16, 24, 3, 2, 1, 1, 12, 1), (24, 20, 3, 1, 1, 1, 8, 1),
     (20, 42, 1, 1, 0, 1, 6, 1), (16, 32, 1, 2, 0, 1, 8, 1)]
 
 
 @pytest.mark.parametrize('convolution', CONVOLUTIONS, ids=str)
-@pytest.mark.parametrize('dtype', [torch.float32, torch.float16])
-@pytest.mark.parametrize('layout', [torch.contiguous_format, torch.channels_last])
+@pytest.mark.parametrize(('dtype', 'layout'), [
+    (torch.float32, torch.contiguous_format), (torch.float16, torch.channels_last)], ids=['single', 'half'])
 def test_a_convolution_with_what_follows_it(convolution, dtype, layout):
     inputs, filters, size, stride, padding, pool, side, groups = convolution
     layer = nn.Conv2d(inputs * groups, filters * groups, size, stride, padding, groups=groups)
@@ -73,8 +79,8 @@ def test_a_linear_layer_with_what_follows_it(inputs, outputs, slope, activation)
     layer, x, added = nn.Linear(inputs, outputs), torch.randn(3, inputs), torch.randn(3, outputs)
     expected = activation(layer(x))
     layer = layer.to(DEVICE)
-    for more in None, added.to(DEVICE):
-        answer = kernels.linear(x.to(DEVICE), layer.weight, layer.bias, slope, more).cpu()
+    for more in None, strewn(added):
+        answer = kernels.linear(strewn(x), layer.weight, layer.bias, slope, more).cpu()
         torch.testing.assert_close(answer, expected if more is None else expected + added, rtol=0, atol=1e-5)
 
 
@@ -82,11 +88,11 @@ def test_a_linear_layer_with_what_follows_it(inputs, outputs, slope, activation)
 def test_cuts_around_joints_in_the_image_at_its_border_and_outside(refiner):
     patch = torch.rand(2, 1, 128, 128) * 2 - 1
     patch[:, :, :40] = FAR
-    joints = torch.tensor([[[0, 0, 0], [0.31, -0.77, 0.4], [1, 1, -0.2]],
-                           [[-1, 0.5, 0], [3, -7, 0], [-0.123, 0.456, 0.9]]], dtype=torch.float32)
+    joints = torch.tensor([[[0, 0, 0], [0.31, -0.77, 0.4], [1, 1, -0.2], [1.1, 0.3, 0.1], [3, 0.2, 0]],
+                           [[-1, 0.5, 0], [3, -7, 0], [-0.123, 0.456, 0.9], [0.3, 1.1, 0.1], [0.2, 3, 0]]])
     for region in build(refiner).regions:
         image = _framed(patch, region)
-        answer = kernels.cut(image.to(DEVICE), joints.to(DEVICE), region).cpu()
+        answer = kernels.cut(strewn(image), strewn(joints), region).cpu()
         torch.testing.assert_close(answer, cut(image, joints, region), rtol=0, atol=1e-5)
 
 
@@ -101,27 +107,27 @@ def patches() -> torch.Tensor:
 
 def test_cells_that_see_something_and_those_that_do_not():
     shown = patches()
-    for answer, expected in zip(kernels.cells(shown.to(DEVICE)), dense.cells(shown), strict=True):
+    for answer, expected in zip(kernels.cells(strewn(shown)), dense.cells(shown), strict=True):
         torch.testing.assert_close(answer.cpu(), expected, rtol=0, atol=1e-6)
 
 
 def test_joints_from_votes():
     positions, seen = dense.cells(patches())
-    maps = torch.randn(4, 5 * 4, 32, 32)  # five joints
-    directions, closeness = maps[:, :15].unflatten(1, (5, 3)), maps[:, 15:] / 3
-    maps = torch.cat([directions.flatten(1, 2), closeness], dim=1).to(DEVICE)
-    answer = kernels.decode(positions.to(DEVICE), seen.to(DEVICE), maps[:, :15].unflatten(1, (5, 3)), maps[:, 15:])
+    maps, others = torch.randn(4, 5 * 4, 32, 32).to(DEVICE), torch.randn(4, 7, 32, 32).to(DEVICE) / 3
+    parts = maps[:, :15].unflatten(1, (5, 3)), others[:, 2:]  # five joints
+    directions, closeness = (part.cpu() for part in parts)
+    answer = kernels.decode(positions.to(DEVICE), seen.to(DEVICE), *parts)
     for told, expected in zip(answer, dense.decode(positions, seen, directions, closeness), strict=True):
         torch.testing.assert_close(told.cpu(), expected, rtol=0, atol=1e-5)
 
 
 def test_the_second_look_sees_what_it_would():
-    network, shown = build('two_looks', width=4), patches()
+    network, shown = build('two_looks', width=4, root=3, knuckles=(5, 9, 14)), patches()
     joints = 0.5 * torch.randn(4, 21, 3)
     joints[1] = 0  # no direction
     joints[2] += torch.tensor([1.3, 0, -0.4])  # looks beyond the patch
     size = torch.tensor([0.0, -0.7, 0.2, 2.0])
-    (middle, turn, scale), seen = kernels.seen(network, *(x.to(DEVICE) for x in (shown, joints, size)))
+    (middle, turn, scale), seen = kernels.seen(network, *map(strewn, (shown, joints, size)))
     view, expected = network.seen(shown, joints, size)
     for told, part in zip((middle, turn, scale), view, strict=True):
         torch.testing.assert_close(told.cpu(), part, rtol=0, atol=1e-6)
@@ -144,15 +150,16 @@ def test_the_refinement_of_joints_in_the_maps_at_their_border_and_outside():
     owner = nn.ModuleDict({'refinement': refinement})
     fuse(owner, kernels)
     owner.to(DEVICE)
-    told = *(x.to(DEVICE) for x in told[:3]), [x.to(DEVICE) for x in local], told[4].to(DEVICE)
+    told = *map(strewn, told[:3]), [x.to(DEVICE) for x in local], told[4].to(DEVICE)
     assert isinstance(owner['refinement'], FusedRefinement)
     torch.testing.assert_close(owner['refinement'](*told).cpu(), expected, rtol=0, atol=1e-5)
     torch.testing.assert_close(owner['refinement'].plain(*told).cpu(), expected, rtol=0, atol=1e-5)
 
 
 def test_few_hands_are_computed_by_them_and_many_give_the_same():
-    layers = nn.Sequential(nn.Sequential(nn.Conv2d(1, 12, 3), nn.MaxPool2d(2), nn.ReLU()), nn.Flatten(),
-                           nn.Linear(12 * 9, 5), nn.ReLU(), nn.Linear(5, 2)).to(DEVICE)
+    other = nn.Conv2d(12, 12, (1, 3))  # which they do not compute
+    layers = nn.Sequential(nn.Sequential(nn.Conv2d(1, 12, 3), nn.MaxPool2d(2), nn.ReLU(), other, nn.ReLU()),
+                           nn.Flatten(), nn.Linear(12 * 3, 5), nn.ReLU(), nn.Linear(5, 2)).to(DEVICE)
     x = torch.randn(kernels.HANDS + 1, 1, 8, 8, device=DEVICE)
     expected = layers(x)
     fuse(layers, kernels)
@@ -160,6 +167,17 @@ def test_few_hands_are_computed_by_them_and_many_give_the_same():
     assert not kernels.gains(layers[0][0].convolution, len(x))
     torch.testing.assert_close(layers(x), expected, rtol=0, atol=1e-5)
     torch.testing.assert_close(layers(x[:2]), expected[:2], rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize('hands', [2, 17])
+def test_the_prior_over_votes(hands):
+    prior, joints, confidence = PriorOverVotes(4, 6), torch.randn(hands, 4, 3), torch.randn(hands, 4)
+    nn.init.normal_(prior.output.weight)
+    expected, owner = prior(joints, confidence), nn.ModuleDict({'prior': prior})
+    fuse(owner, kernels)
+    told = owner.to(DEVICE)['prior'](joints.to(DEVICE), confidence.to(DEVICE))
+    torch.testing.assert_close(told.cpu(), expected, rtol=0, atol=1e-5)
+    assert isinstance(owner['prior'], FusedPrior)
 
 
 @pytest.mark.parametrize('hands', [2, 17])
@@ -171,7 +189,8 @@ def test_few_filters_are_computed_by_them_for_any_number_of_hands(hands):
 
 
 def test_a_dense_network_of_two_looks_is_the_same():
-    network = build('two_looks', width=12, bottleneck=8, refined=True, first={'width': 8, 'bottleneck': 8}).eval()
+    network = build('two_looks', joints=4, knuckles=[1, 3], width=8, bottleneck=8, refined=True,
+                    first={'width': 4, 'bottleneck': 8}).eval()
     for each in network.first, network.second:
         each.maps.weight.mul_(30)
     shown = patches()[1:2]
@@ -183,7 +202,7 @@ def test_a_dense_network_of_two_looks_is_the_same():
 
 def test_what_is_copied_is_the_same():
     source, target = torch.randn(3, 1, 40, 40), torch.zeros(3, 1, 40, 40, pin_memory=DEVICE == 'cuda')
-    kernels.copy(source.to(DEVICE), target)
+    kernels.copy(strewn(source), target)
     if DEVICE == 'cuda':
         torch.cuda.synchronize()
     assert torch.equal(source, target)

@@ -282,16 +282,19 @@ def test_many_hands_run_by_turns_in_graphs_that_none_overwrites_too_soon(count, 
     monkeypatch.setattr(CudaEngine, '_capture', capture)
     monkeypatch.setattr('torch.cuda.current_stream', lambda: 'own')
     monkeypatch.setattr('torch.cuda.set_stream', streams.append)
-    engine = object.__new__(CudaEngine)
-    engine.outputs, engine.streams, engine._captured = ('joints',), ('even', 'odd'), {}
-    patches = np.zeros((count, 1, 128, 128), np.float32)
+    names = iter(('even', 'odd'))
+    monkeypatch.setattr('torch.cuda.Stream', lambda device: next(names))
+    engine = CudaEngine(Pipeline(build('shallow')), 'cpu', None)
+    assert list(engine._captured) == [(1, 0)], 'the first image does not wait'
+    assert engine.pipeline.precision == torch.float16
+    patches = np.zeros((count, 1, 128, 128), np.float32)[..., ::-1]  # in the mirror, as left hands are
     patches[:, 0, 0, 0] = np.arange(count)
     joints = engine.run(patches)
     assert joints.shape == (count, 21, 3)
     np.testing.assert_array_equal(joints[:, 0, 0], np.arange(count))
-    assert len(engine._captured) <= 3
+    assert len(engine._captured) <= 4
     assert streams == ['even', 'own', 'odd', 'own', 'even', 'own', 'odd', 'own'][:2 * max(1, -(-count // LARGEST))]
-    sizes = {0: {1}, 1: {1}, LARGEST: {LARGEST}}.get(count, {LARGEST, 8})  # powers of two, the next larger ones
+    sizes = {0: {1}, 1: {1}, LARGEST: {1, LARGEST}}.get(count, {1, LARGEST, 8})  # the next larger powers of two
     assert {size for size, _ in engine._captured} == sizes
 
 

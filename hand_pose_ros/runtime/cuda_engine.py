@@ -159,7 +159,7 @@ def fastest(pipeline: Pipeline, device: str) -> Engine:
     Kernels are compiled and chosen for the GPU that is there, and it may be the first of its kind. What fails is not
     used.
     """
-    plain = TorchEngine(copy.deepcopy(pipeline))
+    plain = TorchEngine(pipeline)
     for kernels in dict.fromkeys((_own_kernels(), None)):
         try:
             engine = CudaEngine(copy.deepcopy(pipeline), device, kernels)
@@ -170,7 +170,7 @@ def fastest(pipeline: Pipeline, device: str) -> Engine:
             return engine
         _log.warning('a hand takes longer than it could, as %s cannot be used on %s: %s',
                      'kernels of our own' if kernels else 'CUDA graphs', device, problem)
-    return TorchEngine(plain.pipeline, device)
+    return TorchEngine(pipeline, device)
 
 
 def _own_kernels() -> ModuleType | None:

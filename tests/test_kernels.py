@@ -90,7 +90,10 @@ def test_cuts_around_joints_in_the_image_at_its_border_and_outside(refiner):
     patch[:, :, :40] = FAR
     joints = torch.tensor([[[0, 0, 0], [0.31, -0.77, 0.4], [1, 1, -0.2], [1.1, 0.3, 0.1], [3, 0.2, 0]],
                            [[-1, 0.5, 0], [3, -7, 0], [-0.123, 0.456, 0.9], [0.3, 1.1, 0.1], [0.2, 3, 0]]])
-    for region in build(refiner).regions:
+    network = build(refiner)
+    fuse(network, kernels)
+    assert network.cut is kernels.cut
+    for region in network.regions:
         image = _framed(patch, region)
         answer = kernels.cut(strewn(image), strewn(joints), region).cpu()
         torch.testing.assert_close(answer, cut(image, joints, region), rtol=0, atol=1e-5)
@@ -197,6 +200,9 @@ def test_a_dense_network_of_two_looks_is_the_same():
     shown = patches()[1:2]
     pipeline = Pipeline(copy.deepcopy(network))
     fuse(pipeline, kernels)
+    for each in pipeline.network.first, pipeline.network.second:
+        assert (each.cells, each.decode) == (kernels.cells, kernels.decode)
+    assert pipeline.network.seen.func is kernels.seen
     for answer, expected in zip(pipeline.to(DEVICE)(shown.to(DEVICE)), Pipeline(network)(shown), strict=True):
         torch.testing.assert_close(answer.cpu(), expected, rtol=0, atol=1e-4)
 

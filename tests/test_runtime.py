@@ -301,6 +301,7 @@ def test_many_hands_run_by_turns_in_graphs_that_none_overwrites_too_soon(count, 
 @pytest.mark.parametrize('name', ['deep_prior', 'hand_dense'])
 @pytest.mark.parametrize(('moved', 'used', 'said'), [
     ({'own': 0.001}, 'own', ''),
+    ({'none': 0.001}, 'none', 'as kernels of our own cannot be used on cuda: AssertionError'),
     ({'own': np.nan, 'none': 0.001}, 'none', 'as kernels of our own cannot be used on cuda: the joints'),
     ({'own': 0.1, 'none': 0.1}, 'pytorch', 'as CUDA graphs cannot be used on cuda: the joints are not those'),
     ({}, 'pytorch', 'as CUDA graphs cannot be used on cuda: no kernel image')])
@@ -309,22 +310,25 @@ def test_what_is_wrong_or_fails_on_a_gpu_is_done_without(name, moved, used, said
     class Stranger(TorchEngine):
         def __init__(self, pipeline: Pipeline, device: str, kernels: object) -> None:
             self.name = 'own' if kernels else 'none'
+            super().__init__(copy.deepcopy(pipeline))
+            for weight in pipeline.parameters():  # they become other weights
+                weight.zero_()
             if self.name not in moved:
-                raise ValueError('\nno kernel image\nand ten lines more')  # as NVRTC's begin
-            super().__init__(pipeline)
+                raise AssertionError if kernels else ValueError('\nno kernel image\nand more')  # as NVRTC's begin
 
         def run(self, patches: np.ndarray) -> np.ndarray:
             return super().run(patches) + np.float32(moved[self.name])
 
     monkeypatch.setattr('torch.cuda.is_available', lambda: True)
     monkeypatch.setattr('hand_pose_ros.runtime.check_device', lambda device: None)
-    monkeypatch.setattr('hand_pose_ros.runtime.cuda_engine._own_kernels', lambda: copy)  # any module
+    monkeypatch.setattr('hand_pose_ros.runtime.cuda_engine._own_kernels', lambda: copy if moved else None)  # any module
     monkeypatch.setattr('hand_pose_ros.runtime.cuda_engine.CudaEngine', Stranger)
     monkeypatch.setattr('hand_pose_ros.runtime.cuda_engine.TorchEngine', lambda pipeline, _='': TorchEngine(pipeline))
     network = load_checkpoint(name).network
     engine = make_engine(network, 'cuda')
     assert engine.name == used
     assert said in caplog.text and bool(said) == ('a hand takes longer' in caplog.text)
+    assert len(set(caplog.messages)) == len(caplog.messages)
     if used == 'pytorch':
         patches = hand_patches(1)
         np.testing.assert_array_equal(engine.run(patches), TorchEngine(Pipeline(network).eval()).run(patches))
@@ -337,9 +341,10 @@ def test_convolutions_are_exact_whatever_a_program_has_chosen_which_stays(all_of
     before = backends.fp32_precision, conv.fp32_precision
     backends.fp32_precision, conv.fp32_precision = all_of_it, convolutions
     try:
-        with exact_convolutions():
+        with pytest.raises(ValueError, match='a capture'), exact_convolutions():
             assert conv.fp32_precision == 'ieee'
             assert not backends.cudnn.allow_tf32  # nor does reading it, as convolutions do, find the two at odds
+            raise ValueError('a capture that fails')
         assert (backends.fp32_precision, conv.fp32_precision) == (all_of_it, convolutions)
     finally:
         backends.fp32_precision, conv.fp32_precision = before

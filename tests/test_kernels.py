@@ -161,8 +161,9 @@ def test_the_refinement_of_joints_in_the_maps_at_their_border_and_outside():
 
 def test_few_hands_are_computed_by_them_and_many_give_the_same():
     other = nn.Conv2d(12, 12, (1, 3))  # which they do not compute
-    layers = nn.Sequential(nn.Sequential(nn.Conv2d(1, 12, 3), nn.MaxPool2d(2), nn.ReLU(), other, nn.ReLU()),
-                           nn.Flatten(), nn.Linear(12 * 3, 5), nn.ReLU(), nn.Linear(5, 2)).to(DEVICE)
+    layers = nn.Sequential(nn.Sequential(nn.Conv2d(1, 12, 3), nn.MaxPool2d(2), nn.ReLU(), other, nn.ReLU(),
+                                         nn.Conv2d(12, 12, 1), nn.MaxPool2d(1)), nn.Flatten(),
+                           nn.Linear(12 * 3, 5), nn.ReLU(), nn.Linear(5, 2)).to(DEVICE)
     x = torch.randn(kernels.HANDS + 1, 1, 8, 8, device=DEVICE)
     expected = layers(x)
     fuse(layers, kernels)

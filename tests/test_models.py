@@ -533,10 +533,12 @@ def test_a_turn_of_the_patch_is_not_seen_by_the_second_look():
 
 
 def test_two_looks_say_everything_of_the_patch_as_it_is():
-    network = build('two_looks', width=8).eval()
+    network = build('two_looks', width=8, bottleneck=8).eval()
     patches = torch.cat([hand_patches(2), torch.ones(1, 1, 128, 128)])
     answer, (view, shown) = network.forward_full(patches), network.look(patches)
-    seen = network.second.forward_full(shown)
+    first, seen = network.first.forward_full(patches), network.second.forward_full(shown)
+    torch.testing.assert_close(view, network.upright(first['joints'], first['size']))
+    assert torch.equal(shown, view.patch(patches)) and not torch.equal(shown, patches)
     assert answer.keys() == set(network.outputs)
     torch.testing.assert_close(view.into(answer['joints']), seen['joints'], atol=1e-5, rtol=0)
     torch.testing.assert_close(answer['size'], seen['size'] + torch.log(view.scale))

@@ -113,6 +113,20 @@ def test_a_node_that_ends_or_hangs_at_its_start_is_told() -> None:
         live._wait_until(lambda: False, process, 0.0)
 
 
+@pytest.mark.parametrize('come', [3, 5])
+def test_answers_are_waited_for_as_long_as_they_come(monkeypatch: pytest.MonkeyPatch, come: int) -> None:
+    now, listener = [0.0], SimpleNamespace(seen=range(5), answers=[])
+
+    def sleep(_: float) -> None:
+        now[0] += 0.9 * live.QUIET_S
+        if len(listener.answers) < come:
+            listener.answers.append(now[0])
+
+    monkeypatch.setattr(live, 'time', SimpleNamespace(monotonic=lambda: now[0], sleep=sleep))
+    live._Listener.wait_until_quiet(listener)
+    assert len(listener.answers) == come and (now[0] == listener.answers[-1]) == (come == 5), 'no longer than needed'
+
+
 def test_a_node_that_dies_while_it_is_shown_images_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
                                                            ros_domain: int) -> None:
     asked: list[str] = []

@@ -5,7 +5,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
@@ -127,9 +127,11 @@ def test_answers_are_waited_for_as_long_as_they_come(monkeypatch: pytest.MonkeyP
     assert len(listener.answers) == come and (now[0] == listener.answers[-1]) == (come == 5), 'no longer than needed'
 
 
-def test_a_node_that_dies_while_it_is_shown_images_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
-                                                           ros_domain: int) -> None:
+@pytest.mark.parametrize(('patient', 'held'), [(False, [True]), (True, [False, True, True])])
+def test_the_node_is_waited_for_on_request_and_that_it_dies_is_told(
+        monkeypatch: pytest.MonkeyPatch, tmp_path: Path, ros_domain: int, patient: bool, held: list[bool]) -> None:
     asked: list[str] = []
+    waited: list[bool] = []
 
     @contextmanager
     def dead(arguments: list[str]) -> Iterator[subprocess.Popen[bytes]]:
@@ -138,13 +140,20 @@ def test_a_node_that_dies_while_it_is_shown_images_is_told(monkeypatch: pytest.M
         process.wait()
         yield process
 
+    def play(replay: live.Replay, ready: Callable[[], bool] | None = None) -> None:
+        for _ in range(2):  # for the demo, each image but the first waits until the one before is answered
+            waited.extend([not ready()] if ready else [])
+            replay.published[bag.depth_topic] += 1
+
     monkeypatch.setattr(live, '_running', dead)
+    monkeypatch.setattr(live.Replay, 'play', play)
     monkeypatch.setattr(live, '_wait_until', lambda *_: None)
-    monkeypatch.setattr(live, 'QUIET_S', 0.0)
+    monkeypatch.setattr(live._Listener, 'wait_until_quiet', lambda _: waited.append(True))  # always, in the end
     monkeypatch.setattr(live.Replay, 'wait_for_subscribers', lambda *_: None)
     write_bag(tmp_path / 'hand.mcap')
     with DepthBag(tmp_path / 'hand.mcap') as bag, pytest.raises(HandPoseError, match='the node died with exit code 7'):
-        live.play_through_node(bag, '/elsewhere/camera_info', {'model': 'a: b'})
+        live.play_through_node(bag, '/elsewhere/camera_info', {'model': 'a: b'}, patient)
+    assert waited == held
     assert {'transport:="compressedDepth"', 'model:="a: b"', 'depth/camera_info:=/elsewhere/camera_info'} <= set(asked)
     own = f'/evaluation_{os.getpid()}'  # a node of the user that runs beside is not disturbed
     assert {f'__ns:={own}', f'/diagnostics:={own}/diagnostics'} <= set(asked)

@@ -127,7 +127,7 @@ def test_the_table_can_be_written_where_there_are_no_signs_but_ascii(tmp_path, u
     assert '<=20' in done.stdout
 
 
-def test_predictions_are_compared_with_others_of_their_dataset(tmp_path, uvd, capsys):
+def test_predictions_are_compared_with_others_of_their_dataset(tmp_path, uvd, monkeypatch, capsys):
     for name, moved in (('p', 0), ('q', 10), ('g', 0)):
         write_uvd(tmp_path / f'{name}.txt', uvd + np.array([0, 0, moved]))
     arguments = ['evaluate', '--predictions', str(tmp_path / 'p.txt'), '--ground-truth', str(tmp_path / 'g.txt'),
@@ -136,6 +136,13 @@ def test_predictions_are_compared_with_others_of_their_dataset(tmp_path, uvd, ca
     _, own, other = capsys.readouterr().out.splitlines()
     assert own.split()[:4] == ['p', '5', '0', '0.000'] and other.split()[:3] == ['near', '5', '0']
     assert 10 < float(other.split()[3]) < 12
+
+    def full(_):
+        raise OSError('No space left on device')
+
+    monkeypatch.setattr(sys.stdout, 'write', full)
+    assert main([*arguments, '--json', str(tmp_path / 'r.json'), '--out', str(tmp_path / 'r.npz')]) == 1
+    assert (tmp_path / 'r.json').exists() and Result.load(tmp_path / 'r.npz'), 'printing may fail, and comes last'
     with pytest.raises(SystemExit):
         main([*arguments[:3], *arguments[5:]])
     assert '--predictions needs --ground-truth and --dataset' in capsys.readouterr().err

@@ -201,6 +201,8 @@ def test_truth_that_does_not_fit_is_refused(tmp_path, bag, model, result, capsys
         assert message in capsys.readouterr().err
     monkeypatch.setattr(HandPoseEstimator, '__call__', lambda *_, **__: pytest.fail('what is wrong is told first'))
     assert main(arguments(bag, model, '--ground-truth', tmp_path / 'nyu.npz')) == 1
+    assert main(arguments(bag, model, '--ground-truth', tmp_path / 'nyu.npz', '--out', tmp_path / 'nyu.npz')) == 1
+    assert 'nyu.npz: this is the input, which would be lost' in capsys.readouterr().err
     for option in ('--json', '--out', '--report'):
         assert main(arguments(bag, model, option, tmp_path / 'nyu.npz' / 'a' / 'out.npz')) == 1
         assert 'out.npz' in (said := capsys.readouterr().err) and 'cannot be written' in said
@@ -317,7 +319,9 @@ def test_what_is_wrong_with_a_bag_is_said(tmp_path, model, capsys):
     assert 'this is the input, which would be lost' in capsys.readouterr().err
     for more in (('bag.mcap', '--via-ros', '--out-bag', 'x.mcap'), (str(two), '--out', str(two)),
                  (str(two), '--out', 'result'), (str(two), '--dataset', 'nyu'),
-                 ('--predictions', 'p.txt', '--ground-truth', 'g.txt', '--dataset', 'nyu', '--model', model)):
+                 (str(two), '--root', '.'), (str(two), '--split', 'val'), ('msra:P1',),
+                 *((*more, '--predictions', 'p.txt', '--ground-truth', 'g.txt', '--dataset', 'nyu')
+                   for more in (('--model', model), ('--root', '.'), ('bag.mcap',)))):
         with pytest.raises(SystemExit) as caught:
             main(['evaluate', *more])
         assert caught.value.code == 2

@@ -16,16 +16,17 @@ from pathlib import Path
 
 from hand_pose_ros.bags import BagWriter, DepthBag
 from hand_pose_ros.cli import main as hand_pose
+from hand_pose_ros.cli.arguments import add_bag, bag_options
 from hand_pose_ros.errors import HandPoseError
 from hand_pose_ros.estimator import HandPoseEstimator
 
 
-def label(bag: Path, out: Path, estimator: HandPoseEstimator, min_score: float) -> int:
+def label(bag: DepthBag, out: Path, estimator: HandPoseEstimator, min_score: float) -> int:
     """Copy the images in which a hand is found, and its joints, into a new bag. Returns the number of images."""
     estimator.reset()
     count = 0
-    with DepthBag(bag) as source, BagWriter(out) as labelled:
-        for frame in source:
+    with bag, BagWriter(out) as labelled:
+        for frame in bag:
             hands = [hand for hand in estimator(frame.depth, frame.intrinsics) if hand.score >= min_score]
             if hands:
                 labelled.write_depth(frame.stamp_ns, frame.frame_id, frame.depth, frame.intrinsics)
@@ -41,6 +42,7 @@ def main() -> int:
     parser.add_argument('--val', nargs='+', type=Path, required=True, metavar='BAG')
     parser.add_argument('--out', type=Path, required=True, metavar='FOLDER', help='gets bags/ and run/')
     parser.add_argument('--min-score', type=float, default=0.8, help='hands below are not learned from (0.8)')
+    add_bag(parser.add_argument_group('the bags'))
     args, more = parser.parse_known_args()
     if args.out.exists():
         parser.error(f'{args.out} is there already, with bags that would be learned from, too: choose another --out')
@@ -48,7 +50,8 @@ def main() -> int:
     estimator = HandPoseEstimator.from_pretrained()
     for split in ('train', 'val'):
         for number, bag in enumerate(getattr(args, split)):
-            count = label(bag, args.out / 'bags' / split / f'{number}_{bag.stem}.mcap', estimator, args.min_score)
+            labelled = args.out / 'bags' / split / f'{number}_{bag.stem}.mcap'
+            count = label(DepthBag(bag, **bag_options(args)), labelled, estimator, args.min_score)
             print(f'{split}: {count} images of {bag}', flush=True)
     return hand_pose(['train', 'paper', '--out', str(args.out / 'run'), '--set', 'dataset=bags',
                       '--set', f'root={args.out / "bags"}', *more])

@@ -125,7 +125,8 @@ def test_train_on_your_bags(run: Callable[..., str], film: Film) -> None:
     write_bag(Path('tuesday.mcap'), film[6:])
     settings = ('samples=32', 'batch_size=16', 'shard_size=16', 'options.bottleneck=2', 'val_samples=2')
     said = run('train_on_your_bags.py', '--train', 'monday.mcap', '--val', 'tuesday.mcap', '--out', 'mine',
-               '--min-score', 0.3, '--workers', 0, *(f'--set={setting}' for setting in settings))
+               '--intrinsics', *camera(film[0][1]), '--min-score', 0.3, '--workers', 0,
+               *(f'--set={setting}' for setting in settings))
     assert re.search(r'train: [3-6] images of monday.mcap\nval: [12] images of tuesday.mcap', said)
     checkpoint = load_checkpoint('mine/run/best.safetensors')
     assert checkpoint.metadata['skeleton'] == 'hand21' and checkpoint.metadata['architecture'] == 'deep'

@@ -71,17 +71,12 @@ def test_what_is_no_file_is_written_to_and_not_replaced(tmp_path):
     os.close(writing)
 
 
-@pytest.mark.parametrize('said', ['No space left on device', 'database or disk is full', 'Disk quota exceeded'])
-def test_a_full_disk_is_told_with_the_file(tmp_path, said):
-    with pytest.raises(InputError, match=r'a\.json: cannot be written, for the disk is full'), \
-            in_one_step(tmp_path / 'a.json'):
-        raise OSError(said)
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize('said', ['File too large', 'Input/output error', 'disk I/O error'])
-def test_a_disk_that_does_not_take_a_file_is_told_with_it(tmp_path, said):
-    with pytest.raises(InputError, match=rf'a\.json: cannot be written \({said}\): choose another place'), \
-            in_one_step(tmp_path / 'a.json'):
+@pytest.mark.parametrize(('said', 'told'), [
+    *((said, 'for the disk is full') for said in ('No space left on device', 'database or disk is full',
+                                                  'Disk quota exceeded')),
+    *((said, rf'\({said}\): choose another place') for said in ('File too large', 'Input/output error',
+                                                               'disk I/O error'))])
+def test_a_disk_that_does_not_take_a_file_is_told_with_it(tmp_path, said, told):
+    with pytest.raises(InputError, match=rf'a\.json: cannot be written,? {told}'), in_one_step(tmp_path / 'a.json'):
         raise OSError(said)
     assert not list(tmp_path.iterdir())

@@ -43,7 +43,7 @@ class _Captured:
 
     def start(self) -> None:
         """Launch the replay."""
-        # `with torch.cuda.stream` does the same, but takes ten microseconds longer.
+        # `with torch.cuda.stream` does the same, but takes microseconds longer.
         before = torch.cuda.current_stream()
         torch.cuda.set_stream(self.stream)
         try:

@@ -23,7 +23,7 @@ class Convolution(nn.Module):
     """A convolution, an optional addition, max-pooling, and ReLU if `relu`.
 
     Args:
-        planes: the answer is float32, and its pixels lie side by side.
+        planes: what `kernels` answers is float32, and its pixels lie side by side.
         kernels: `runtime.kernels`, which computes it for few hands; None = PyTorch does.
     """
 
@@ -40,8 +40,7 @@ class Convolution(nn.Module):
         if added is not None and added.shape[2] < x.shape[2]:
             added = F.interpolate(added, scale_factor=2, mode='nearest')
         y = self._convolved(x, added)
-        y = F.max_pool2d(y, self.pool) if self.pool > 1 else y  # after ReLU, the result is the same
-        return y.float().contiguous() if self.planes else y
+        return F.max_pool2d(y, self.pool) if self.pool > 1 else y  # after ReLU, the result is the same
 
     def _convolved(self, x: Tensor, added: Tensor | None) -> Tensor:
         layer = self.convolution

@@ -259,5 +259,5 @@ def _copy(x, y, count, BLOCK: tl.constexpr):
 
 
 def copy(source: Tensor, target: Tensor) -> None:
-    """Copy between pinned memory and the GPU, for little data: PyTorch's copy takes five microseconds to start."""
+    """Copy between pinned memory and the GPU, for little data: PyTorch's copies take longer to start."""
     _copy[(triton.cdiv(source.numel(), 1024),)](source.contiguous(), target, source.numel(), BLOCK=1024)
